@@ -1,0 +1,231 @@
+"""The four action modes: what a number in [-1, 1] does to the poses of the EPMs.
+
+Mode    Size  An action is
+``home``   5 N  an offset from the home configuration in the frame carried by the robots (measured headings)
+``pose``   5 N  an absolute pose in the global frame, scaled from its bounds
+``step``   5 N  a change of the present pose
+``wrench`` 6    F_x, F_y, tau_z on each robot in the global frame, turned into poses by ``allocation``
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.allocation import best_of, component_scales
+from magenv.kernels import kernel
+from magenv.params import System, require
+from magenv.poses import (
+    HOME_RADIUS_M,
+    POSE_SIZE,
+    epm_to_pose,
+    home_pose,
+    pose_bounds,
+    pose_to_epm,
+    project_epms,
+    robots_frame,
+)
+from magenv.wrench import WRENCH_SIZE
+
+Floats = NDArray[np.float64]
+ActionMode = Literal["home", "pose", "step", "wrench"]
+
+HOME_ANGLE_RAD = 1.2
+"""Largest offset of an angle in ``home``."""
+HOME_RADIUS_OUT_M = 0.15
+"""Largest offset of a radius outwards in ``home``; inwards it reaches r_min."""
+STEP_ANGLE_RAD = 0.3
+STEP_RADIUS_M = 0.05
+WRENCH_FORCE_N = 0.020
+WRENCH_TORQUE_NM = 0.001
+
+_FALLBACK_STARTS = 4
+_TOLERANCE = 1e-6
+_MAX_ITERATIONS = 60
+
+
+@kernel
+def home_epms(action: Floats, frame: float, home: Floats, r_min: float, epms: Floats) -> None:
+    """Write the EPMs (N, 6) offset by ``action`` (5 N) from ``home`` turned to the robots' frame."""
+    pose = np.empty(POSE_SIZE)
+    for k in range(len(epms)):
+        for i in range(POSE_SIZE):
+            a = action[POSE_SIZE * k + i]
+            pose[i] = home[POSE_SIZE * k + i]
+            if i == 2:
+                pose[i] += a * (HOME_RADIUS_OUT_M if a > 0.0 else HOME_RADIUS_M - r_min)
+            else:
+                pose[i] += HOME_ANGLE_RAD * a
+        pose[0] += frame
+        pose[3] += frame
+        pose_to_epm(pose, epms[k])
+
+
+@kernel
+def _home_rows(
+    actions: Floats, measured: Floats, home: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
+) -> None:
+    for i in range(len(actions)):
+        home_epms(actions[i], robots_frame(measured[i, 0, 2], measured[i, 1, 2]), home, limits[0], targets[i])
+        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+
+
+@kernel
+def _pose_rows(
+    actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
+) -> None:
+    pose = np.empty(POSE_SIZE)
+    for i in range(len(actions)):
+        for k in range(targets.shape[1]):
+            for j in range(POSE_SIZE):
+                at = POSE_SIZE * k + j
+                pose[j] = low[at] + 0.5 * (actions[i, at] + 1.0) * (high[at] - low[at])
+            pose_to_epm(pose, targets[i, k])
+        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+
+
+@kernel
+def _step_rows(
+    actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
+) -> None:
+    pose = np.empty(POSE_SIZE)
+    for i in range(len(actions)):
+        for k in range(targets.shape[1]):
+            epm_to_pose(epms[i, k], pose)
+            for j in range(POSE_SIZE):
+                pose[j] += actions[i, POSE_SIZE * k + j] * (STEP_RADIUS_M if j == 2 else STEP_ANGLE_RAD)
+            pose[2] = min(max(pose[2], limits[0]), limits[1])
+            pose_to_epm(pose, targets[i, k])
+        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+
+
+@kernel
+def planar_target(wrench: Floats, heading_1: float, heading_2: float, target: Floats) -> None:
+    """Write U_d (10) of planar wrenches (F_x, F_y, tau_z per robot, global frame); out-of-plane components zero."""
+    for robot, heading in ((0, heading_1), (1, heading_2)):
+        c, s = math.cos(heading), math.sin(heading)
+        fx, fy = wrench[3 * robot], wrench[3 * robot + 1]
+        at = 5 * robot
+        target[at], target[at + 1] = 0.0, wrench[3 * robot + 2]
+        target[at + 2], target[at + 3], target[at + 4] = c * fx + s * fy, c * fy - s * fx, 0.0
+
+
+@kernel
+def _wrench_rows(
+    actions: Floats,
+    measured: Floats,
+    epms: Floats,
+    starts: Floats,
+    ipm_moment: float,
+    epm_moment: float,
+    scale: Floats,
+    limits: Floats,
+    targets: Floats,
+    projected: NDArray[np.bool_],
+) -> None:
+    n_epm = targets.shape[1]
+    size = POSE_SIZE * n_epm
+    positions, moments = np.zeros((2, 3)), np.zeros((2, 3))
+    wrench, target, relative = np.empty(6), np.empty(WRENCH_SIZE), np.empty(WRENCH_SIZE)
+    best_pose, best_wrench = np.empty(size), np.empty(WRENCH_SIZE)
+    for i in range(len(actions)):
+        for robot in range(2):
+            positions[robot, 0], positions[robot, 1] = measured[i, robot, 0], measured[i, robot, 1]
+            moments[robot, 0] = ipm_moment * math.cos(measured[i, robot, 2])
+            moments[robot, 1] = ipm_moment * math.sin(measured[i, robot, 2])
+            for j in range(3):
+                wrench[3 * robot + j] = actions[i, 3 * robot + j] * (WRENCH_TORQUE_NM if j == 2 else WRENCH_FORCE_N)
+        planar_target(wrench, measured[i, 0, 2], measured[i, 1, 2], target)
+        norm = 0.0
+        for j in range(WRENCH_SIZE):
+            norm += (scale[j] * target[j]) ** 2
+        norm = max(math.sqrt(norm), 1e-6)
+        for j in range(WRENCH_SIZE):
+            relative[j] = scale[j] / norm
+        poses = starts.copy()
+        for k in range(n_epm):
+            epm_to_pose(epms[i, k], poses[0, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
+        best_of(
+            target,
+            positions,
+            moments,
+            epm_moment,
+            limits,
+            relative,
+            _TOLERANCE,
+            _MAX_ITERATIONS,
+            True,
+            poses,
+            best_pose,
+            best_wrench,
+        )
+        for k in range(n_epm):
+            pose_to_epm(best_pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], targets[i, k])
+        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+
+
+class Actions:
+    """One action mode for a system: turns actions (n, size) into commanded EPMs (n, N, 6)."""
+
+    def __init__(self, mode: ActionMode, system: System) -> None:
+        require(mode in get_args(ActionMode), "action", "one of " + ", ".join(get_args(ActionMode)), mode)
+        self.mode = mode
+        self.size = 6 if mode == "wrench" else POSE_SIZE * system.n_epm
+        self._system = system
+        self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
+        self._home = home_pose(system.n_epm)
+        self._low, self._high = pose_bounds(system)
+        # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
+        fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))
+        self._starts = np.concatenate([self._home[None], self._home[None], fallback])
+        self._scale = 1.0 / component_scales()
+
+    def home(self, measured: Floats) -> Floats:
+        """Return the EPMs (n, N, 6) at home for robots measured at (n, 2, 3)."""
+        targets = np.empty((len(measured), self._system.n_epm, 6))
+        zeros = np.zeros((len(measured), len(self._home)))
+        _home_rows(zeros, measured, self._home, self._limits, targets, np.empty(len(measured), np.bool_))
+        return targets
+
+    def to_epms(self, actions: Floats, measured: Floats, epms: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the commanded EPMs (n, N, 6) and where the least gap made them differ from the action.
+
+        Parameters
+        ----------
+        actions : ndarray, shape (n, size)
+            Within [-1, 1].
+        measured : ndarray, shape (n, 2, 3)
+            Measured x, y (m) and heading (rad) of the robots.
+        epms : ndarray, shape (n, N, 6)
+            Present EPMs.
+        """
+        targets, projected = np.empty_like(epms), np.empty(len(epms), np.bool_)
+        if self.mode == "home":
+            _home_rows(actions, measured, self._home, self._limits, targets, projected)
+        elif self.mode == "pose":
+            _pose_rows(actions, self._low, self._high, self._limits, targets, projected)
+        elif self.mode == "step":
+            _step_rows(actions, epms, self._limits, targets, projected)
+        else:
+            _wrench_rows(
+                actions,
+                measured,
+                epms,
+                self._starts,
+                self._system.ipm_moment_am2,
+                self._system.epm_moment_am2,
+                self._scale,
+                self._limits,
+                targets,
+                projected,
+            )
+        return targets, projected
+
+
+def pose_to_action(pose: Floats, system: System) -> NDArray[np.float32]:
+    """Return the ``pose`` action (5 N) that commands a pose vector (5 N) given in canonical angles."""
+    low, high = pose_bounds(system)
+    return np.clip(2 * (pose - low) / (high - low) - 1, -1, 1).astype(np.float32)

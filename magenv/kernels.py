@@ -1,0 +1,49 @@
+"""How the numerical kernels are compiled: ahead of first use, cached on disk, in IEEE arithmetic."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def _cache_dir() -> Path:
+    """Return a cache folder named after the content of all sources.
+
+    Numba renews a cached function when its own file changes, not when a file whose kernels it calls does; one folder
+    per state of the sources can never serve stale physics.
+    """
+    package = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(package.glob("*.py")):
+        text = source.read_bytes()
+        if b"@kernel" in text:
+            digest.update(source.name.encode() + b"\0" + text)
+    root = Path(os.environ.get("NUMBA_CACHE_DIR") or package / "__pycache__")
+    if not os.access(package, os.W_OK) and "NUMBA_CACHE_DIR" not in os.environ:
+        root = Path.home() / ".cache" / "magenv"
+    return root / f"kernels-{digest.hexdigest()[:16]}"
+
+
+_CACHE_DIR = str(_cache_dir())
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` with numba on first use and keep the machine code on disk.
+
+    ``error_model="numpy"``: a division by zero gives infinity or NaN, as in numpy, instead of an exception. No fast
+    mathematics: NaN and infinity stay visible, and scalar and batched calls give the same bits.
+    """
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _CACHE_DIR
+    try:
+        compiled: Function = numba.njit(cache=True, error_model="numpy")(function)
+        return compiled
+    finally:
+        numba.config.CACHE_DIR = before

@@ -1,0 +1,173 @@
+"""Physical and task parameters: frozen dataclasses, SI units, derived values as properties.
+
+Every value says where it comes from: **paper** (Davy et al. 2023), **literature** (source named) or **calibrated**
+(chosen so that the paper's controller shows the paper's outcome; see README, "Where the numbers come from").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+MU_0 = 4e-7 * math.pi
+"""Vacuum permeability in H/m, the value of the paper."""
+
+
+def require(condition: bool, name: str, must_be: str, received: object) -> None:
+    """Raise ``ValueError`` in the one form used for all bad input of this package."""
+    if not condition:
+        raise ValueError(f"Input {name} must be {must_be}; instead received {received!r}.")
+
+
+def _require_positive(**values: float) -> None:
+    for name, value in values.items():
+        require(math.isfinite(value) and value > 0, name, "a positive, finite number", value)
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """Cylindrical permanent magnet, uniformly magnetised along its axis."""
+
+    diameter_m: float
+    length_m: float
+    remanence_t: float = 1.48
+    """Remanence of NdFeB N52 (literature: upper end of the grade's 1.43 to 1.48 T)."""
+
+    def __post_init__(self) -> None:
+        _require_positive(diameter_m=self.diameter_m, length_m=self.length_m, remanence_t=self.remanence_t)
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume in m^3."""
+        return math.pi / 4 * self.diameter_m**2 * self.length_m
+
+    @property
+    def moment_am2(self) -> float:
+        """Magnetic moment in A m^2: remanence times volume over the vacuum permeability."""
+        return self.remanence_t * self.volume_m3 / MU_0
+
+
+@dataclass(frozen=True)
+class System:
+    """The magnets and the limits of the external ones (paper, section III)."""
+
+    n_epm: int = 2
+    """Number of external permanent magnets (EPMs)."""
+    ipm: Magnet = field(default_factory=lambda: Magnet(diameter_m=5e-3, length_m=5e-3))
+    """The magnet inside each robot (paper)."""
+    reference_epm: Magnet = field(default_factory=lambda: Magnet(diameter_m=0.1, length_m=0.1))
+    """Two of these are the total magnetic volume that the EPMs share, whatever their number (paper)."""
+    r_min_m: float = 0.15
+    """Least distance of an EPM's centre from the workspace centre (paper)."""
+    r_max_m: float = 0.5
+    """Greatest distance of an EPM's centre from the workspace centre (not in the paper; reach of a collaborative arm)."""
+    attraction_max_n: float = 98.1
+    """Greatest mutual attraction of two EPMs, 10 kg of payload (paper)."""
+
+    def __post_init__(self) -> None:
+        require(
+            isinstance(self.n_epm, int) and not isinstance(self.n_epm, bool) and self.n_epm >= 1,
+            "n_epm",
+            "a whole number of at least 1",
+            self.n_epm,
+        )
+        _require_positive(r_min_m=self.r_min_m, r_max_m=self.r_max_m, attraction_max_n=self.attraction_max_n)
+        require(self.r_max_m > self.r_min_m, "r_max_m", f"greater than r_min_m = {self.r_min_m}", self.r_max_m)
+
+    @property
+    def ipm_moment_am2(self) -> float:
+        """Moment of a robot's magnet in A m^2."""
+        return self.ipm.moment_am2
+
+    @property
+    def epm_moment_am2(self) -> float:
+        """Moment of each EPM in A m^2: the volume of two reference magnets shared by ``n_epm``."""
+        return 2.0 / self.n_epm * self.reference_epm.moment_am2
+
+    @property
+    def gap_min_m(self) -> float:
+        """Least distance of two EPM centres in m: there, coaxial, they attract each other with ``attraction_max_n``."""
+        return float((3 * MU_0 * self.epm_moment_am2**2 / (2 * math.pi * self.attraction_max_n)) ** 0.25)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A robot's body: a disc in the plane of motion."""
+
+    mass_kg: float = 0.010
+    """Literature: 8.56 g (MagRobot, capsule of 0.126 A m^2); rounded up."""
+    inertia_kgm2: float = 1e-6
+    """About the vertical; a capsule of 10 g, 11 mm wide and 26 mm long, has 6e-7, and carries fluid with it."""
+    drag_linear_nspm: float = 0.36
+    """Viscous drag against translation, N s/m (calibrated within 0.15 to 0.4)."""
+    drag_rotational_nmsprad: float = 5.3e-5
+    """Viscous drag against rotation, N m s/rad (calibrated within 5e-5 to 2e-4)."""
+    diameter_m: float = 0.011
+    """Literature: commercial capsules are 10 to 12 mm wide."""
+
+    def __post_init__(self) -> None:
+        _require_positive(mass_kg=self.mass_kg, inertia_kgm2=self.inertia_kgm2, diameter_m=self.diameter_m)
+        for name in ("drag_linear_nspm", "drag_rotational_nmsprad"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, "a finite number of at least 0", value)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """What the controllers act on: bodies, wall, integrator."""
+
+    body: Body = field(default_factory=Body)
+    workspace_radius_m: float = 0.100
+    """Radius of the circular wall."""
+    substep_s: float = 0.005
+    """The integrator's step, fixed in seconds whatever the control rate."""
+
+    def __post_init__(self) -> None:
+        _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
+        require(
+            self.workspace_radius_m > self.body.diameter_m,
+            "workspace_radius_m",
+            f"greater than the body's diameter {self.body.diameter_m}",
+            self.workspace_radius_m,
+        )
+
+
+PLANTS: dict[str, Plant] = {"paper": Plant()}
+"""The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation."""
+
+
+@dataclass(frozen=True)
+class TaskParams:
+    """Control rate, start and limits of an episode."""
+
+    control_hz: float = 2.0
+    """Control rate (paper)."""
+    start_position_sd_m: float = 1e-3
+    """Standard deviation of a robot's start offset, per axis."""
+    start_heading_sd_rad: float = math.radians(3.0)
+    """Standard deviation of a robot's start heading offset."""
+    loss_distance_m: float = 0.030
+    """Control is lost where a robot is farther than this from its reference."""
+    tracking_distance_m: float = 0.015
+    """A robot nearer than this to its reference counts as tracking (``separation_tracked``)."""
+
+    def __post_init__(self) -> None:
+        _require_positive(
+            control_hz=self.control_hz,
+            loss_distance_m=self.loss_distance_m,
+            tracking_distance_m=self.tracking_distance_m,
+        )
+        for name in ("start_position_sd_m", "start_heading_sd_rad"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, name, "a finite number of at least 0", value)
+
+    @property
+    def period_s(self) -> float:
+        """Control period in s."""
+        return 1.0 / self.control_hz
+
+
+def choose(table: dict[str, Plant], name: str, value: str) -> Plant:
+    """Return ``table[value]`` or raise ``ValueError`` naming the known keys."""
+    require(value in table, name, "one of " + ", ".join(sorted(table)), value)
+    return table[value]

@@ -1,0 +1,187 @@
+"""Poses of the external magnets (EPMs): spherical vector, Cartesian form, bounds, least gap, home configuration.
+
+A pose vector holds five numbers per EPM in the paper's order: azimuth, elevation and radius of its centre, azimuth and
+elevation of its moment (rad, rad, m, rad, rad). Inside the kernels an EPM is a row of six: centre (m), unit moment.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magenv.kernels import kernel
+from magenv.params import System, require
+
+Floats = NDArray[np.float64]
+
+POSE_SIZE = 5
+"""Numbers per EPM in a pose vector."""
+GAP_TOLERANCE_M = 1e-9
+"""Within this the least gap and the radius limits hold after ``project``."""
+
+HOME_RADIUS_M = 0.2
+HOME_TILT_RAD = {2: math.radians(34.0), 3: math.radians(10.0)}
+"""Angle of the first EPM above the plane, by number of EPMs. Untilted, the EPMs lie in the robots' plane or opposite
+each other in it, and out-of-plane moments do nothing to first order."""
+SECOND_ROBOT_WEIGHT = 0.8
+"""Share of robot 2 in the robots' frame: below one, so that the frame exists for antiparallel robots too."""
+
+
+@kernel
+def pose_to_epm(pose: Floats, epm: Floats) -> None:
+    """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
+    azimuth, elevation, radius, moment_azimuth, moment_elevation = pose[0], pose[1], pose[2], pose[3], pose[4]
+    epm[0] = radius * math.cos(elevation) * math.cos(azimuth)
+    epm[1] = radius * math.cos(elevation) * math.sin(azimuth)
+    epm[2] = radius * math.sin(elevation)
+    epm[3] = math.cos(moment_elevation) * math.cos(moment_azimuth)
+    epm[4] = math.cos(moment_elevation) * math.sin(moment_azimuth)
+    epm[5] = math.sin(moment_elevation)
+
+
+@kernel
+def epm_to_pose(epm: Floats, pose: Floats) -> None:
+    """Write the pose (5,) of ``epm`` (6,), azimuths in [-pi, pi], elevations in [-pi/2, pi/2]."""
+    pose[0] = math.atan2(epm[1], epm[0])
+    pose[1] = math.atan2(epm[2], math.hypot(epm[0], epm[1]))
+    pose[2] = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
+    pose[3] = math.atan2(epm[4], epm[3])
+    pose[4] = math.atan2(epm[5], math.hypot(epm[3], epm[4]))
+
+
+@kernel
+def clip_radius(epm: Floats, r_min: float, r_max: float) -> None:
+    """Move the centre of ``epm`` (6,) along its radius into [r_min, r_max]."""
+    radius = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
+    if r_min <= radius <= r_max:
+        return
+    scale = min(max(radius, r_min), r_max) / radius
+    for i in range(3):
+        epm[i] *= scale
+
+
+@kernel
+def separate(first: Floats, second: Floats, gap: float) -> float:
+    """Move two EPM centres apart along their joining line to the gap; return by how much they were too close (m)."""
+    dx, dy, dz = second[0] - first[0], second[1] - first[1], second[2] - first[2]
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    short = gap - distance
+    if short <= 0.0:
+        return 0.0
+    if distance < 1e-9:  # no joining line: take a tangent of the sphere, the flattest way out
+        dx, dy, dz = -first[1], first[0], 0.0
+        if math.hypot(dx, dy) < 1e-9:
+            dx, dy = 1.0, 0.0
+        distance = math.hypot(dx, dy)
+    push = 0.5 * short / distance
+    first[0] -= push * dx
+    first[1] -= push * dy
+    first[2] -= push * dz
+    second[0] += push * dx
+    second[1] += push * dy
+    second[2] += push * dz
+    return short
+
+
+@kernel
+def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
+    """Make ``epms`` (N, 6) feasible in place, moments kept; return whether any centre moved by over 1e-9 m."""
+    n = len(epms)
+    for i in range(n):
+        clip_radius(epms[i], r_min, r_max)
+    moved = False
+    for _ in range(10_000):
+        worst = 0.0
+        for i in range(n):
+            for j in range(i + 1, n):
+                worst = max(worst, separate(epms[i], epms[j], gap))
+        if worst <= GAP_TOLERANCE_M:
+            break
+        moved = True
+        for i in range(n):
+            clip_radius(epms[i], r_min, r_max)
+    return moved
+
+
+@kernel
+def robots_frame(heading_1: float, heading_2: float) -> float:
+    """Return the heading (rad) of the frame the robots carry: along h1 + 0.8 h2.
+
+    For parallel robots it is their mean heading. The plain mean does not exist for antiparallel ones, and no rule
+    that treats both alike does; here robot 1 decides, smoothly.
+    """
+    return math.atan2(
+        math.sin(heading_1) + SECOND_ROBOT_WEIGHT * math.sin(heading_2),
+        math.cos(heading_1) + SECOND_ROBOT_WEIGHT * math.cos(heading_2),
+    )
+
+
+def home_pose(n_epm: int) -> Floats:
+    """Return the home pose vector (5 N) in the robots' frame, whose x axis is the heading.
+
+    The EPMs stand on a ring round the heading through the workspace centre, broadside to it, their moments against
+    the heading: there the fields of all add up along the robots' moments.
+    """
+    require(n_epm in HOME_TILT_RAD, "n_epm", "2 or 3", n_epm)
+    poses = np.empty((n_epm, POSE_SIZE))
+    for i, angle in enumerate(HOME_TILT_RAD[n_epm] + 2 * math.pi * np.arange(n_epm) / n_epm):
+        epm = np.array([0.0, HOME_RADIUS_M * math.cos(angle), HOME_RADIUS_M * math.sin(angle), -1.0, 0.0, 0.0])
+        epm_to_pose(epm, poses[i])
+    return poses.reshape(-1)
+
+
+def pose_bounds(system: System) -> tuple[Floats, Floats]:
+    """Return the lower and upper bounds (5 N each) of a pose vector."""
+    low = [-math.pi, -math.pi / 2, system.r_min_m, -math.pi, -math.pi / 2]
+    high = [math.pi, math.pi / 2, system.r_max_m, math.pi, math.pi / 2]
+    return np.tile(low, system.n_epm), np.tile(high, system.n_epm)
+
+
+def _as_rows(values: ArrayLike, width: int, name: str, must_be: str) -> Floats:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    require(array.ndim >= 1 and array.shape[-1] > 0 and array.shape[-1] % width == 0, name, must_be, array.shape)
+    return array
+
+
+def to_cartesian(pose: ArrayLike) -> tuple[Floats, Floats]:
+    """Return centres (..., N, 3) in m and unit moments (..., N, 3) of pose vectors (..., 5 N).
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not a multiple of 5.
+    """
+    array = _as_rows(pose, POSE_SIZE, "pose", "an array of shape (..., 5 N)")
+    rows = array.reshape(-1, POSE_SIZE)
+    epms = np.empty((len(rows), 6))
+    for row, epm in zip(rows, epms, strict=True):
+        pose_to_epm(row, epm)
+    epms = epms.reshape(*array.shape[:-1], -1, 6)
+    return epms[..., :3].copy(), epms[..., 3:].copy()
+
+
+def from_cartesian(positions: ArrayLike, directions: ArrayLike) -> Floats:
+    """Return the pose vectors (..., 5 N) of centres (..., N, 3) in m and moment directions (..., N, 3)."""
+    centres = _as_rows(positions, 3, "positions", "an array of shape (..., N, 3)")
+    moments = _as_rows(directions, 3, "directions", "an array of shape (..., N, 3)")
+    require(centres.shape == moments.shape, "directions", f"of the shape of positions {centres.shape}", moments.shape)
+    epms = np.concatenate([centres, moments], axis=-1).reshape(-1, 6)
+    poses = np.empty((len(epms), POSE_SIZE))
+    for epm, row in zip(epms, poses, strict=True):
+        epm_to_pose(epm, row)
+    return poses.reshape(*centres.shape[:-2], -1)
+
+
+def project(pose: ArrayLike, system: System) -> tuple[Floats, bool]:
+    """Return the nearest allowed pose vector (5 N) and whether the least gap made it differ.
+
+    Centres that are too close are moved apart symmetrically along their joining line and their radii clipped, in
+    turns, until both hold within 1e-9 m; moments are kept.
+    """
+    array = _as_rows(pose, POSE_SIZE, "pose", "an array of shape (5 N,)")
+    centres, moments = to_cartesian(array)
+    epms = np.concatenate([centres, moments], axis=-1)
+    moved = project_epms(epms, system.r_min_m, system.r_max_m, system.gap_min_m)
+    return from_cartesian(epms[:, :3], epms[:, 3:]), bool(moved)
