@@ -82,10 +82,23 @@ def planar_wrench(robots: Floats, epms: Floats, ipm_moment: Floats, epm_moment: 
 
 
 @kernel
-def drag_factors(drag: float, inertia: float, h: float) -> tuple[float, float]:
-    """Return (decay, gain) of v(t + h) = decay v + gain F, exact for constant force F under viscous drag."""
+def _drag(drag: float, inertia: float, h: float) -> tuple[float, float]:
     decay = math.exp(-drag * h / inertia)
     return decay, (1.0 - decay) / drag if drag > 0.0 else h / inertia
+
+
+@kernel
+def drag_factors(physics: Physics, row: int, h: float, factors: Floats) -> None:
+    """Write (decay, gain) of v(t + h) = decay v + gain F per robot and axis x, y, heading into ``factors`` (2, 3, 2).
+
+    Exact for constant force F under viscous drag; the same for every substep of length ``h``.
+    """
+    for robot in range(2):
+        linear = _drag(physics.drag_linear[row, robot], physics.mass[row, robot], h)
+        factors[robot, 0, 0], factors[robot, 0, 1] = linear
+        factors[robot, 1, 0], factors[robot, 1, 1] = linear
+        turning = _drag(physics.drag_rotational[row, robot], physics.inertia[row, robot], h)
+        factors[robot, 2, 0], factors[robot, 2, 1] = turning
 
 
 @kernel
@@ -120,8 +133,12 @@ def resolve_contact(robots: Floats, mass: Floats, diameter: float, wall_radius: 
 
 
 @kernel
-def advance(robots: Floats, epms: Floats, physics: Physics, row: int, h: float, force: Floats) -> int:
-    """Advance both robots (2, 6) by ``h`` in place; ``force`` (2, 3) is scratch. Return the contact flags.
+def advance(
+    robots: Floats, epms: Floats, physics: Physics, row: int, h: float, factors: Floats, force: Floats
+) -> int:
+    """Advance both robots (2, 6) by ``h`` in place; return the contact flags.
+
+    ``factors`` are those of ``drag_factors`` for ``h``, ``force`` (2, 3) is scratch.
 
     Half a drift, a kick with drag integrated exactly, half a drift: symmetric, so of second order, with one evaluation
     of the wrench; exact for the terminal velocity however strong the drag.
@@ -131,12 +148,9 @@ def advance(robots: Floats, epms: Floats, physics: Physics, row: int, h: float, 
             robots[robot, axis] += 0.5 * h * robots[robot, 3 + axis]
     planar_wrench(robots, epms, physics.ipm_moment[row], physics.epm_moment[row], force)
     for robot in range(2):
-        decay, gain = drag_factors(physics.drag_linear[row, robot], physics.mass[row, robot], h)
-        robots[robot, 3] = decay * robots[robot, 3] + gain * force[robot, 0]
-        robots[robot, 4] = decay * robots[robot, 4] + gain * force[robot, 1]
-        decay, gain = drag_factors(physics.drag_rotational[row, robot], physics.inertia[row, robot], h)
-        robots[robot, 5] = decay * robots[robot, 5] + gain * force[robot, 2]
         for axis in range(3):
+            decay, gain = factors[robot, axis, 0], factors[robot, axis, 1]
+            robots[robot, 3 + axis] = decay * robots[robot, 3 + axis] + gain * force[robot, axis]
             robots[robot, axis] += 0.5 * h * robots[robot, 3 + axis]
     return resolve_contact(robots, physics.mass[row], physics.body_diameter, physics.wall_radius)
 

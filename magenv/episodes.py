@@ -52,7 +52,7 @@ class Episodes:
 
     def __init__(self, n: int, settings: Settings) -> None:
         require(settings.n_epm in (2, 3) and not isinstance(settings.n_epm, bool), "n_epm", "2 or 3", settings.n_epm)
-        plant = choose(PLANTS, "plant", settings.plant)
+        plant = self.plant = choose(PLANTS, "plant", settings.plant)
         check_scenario(settings.scenario)
         self.settings = settings
         self.system = System(n_epm=settings.n_epm)
@@ -136,11 +136,10 @@ class Episodes:
     def state_info(self) -> dict[str, NDArray[Any]]:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""
         w = self.world
-        reference = np.stack([self.reference(row) for row in range(len(self._measured))])
         return {
             "time_s": w.time_s(),
             "robots": w.robots.copy(),
-            "reference": reference,
+            "reference": w.references(),
             "epm_pose": from_cartesian(w.epms[..., :3], w.epms[..., 3:]),
         }
 
@@ -150,10 +149,3 @@ class Episodes:
         info |= {f"reward_{name}": value.copy() for name, value in self._terms.items()}
         info["projected"] = self._projected.copy()
         return info
-
-    def reference(self, row: int) -> Floats:
-        """Return the reference (2, 3) of ``row`` at the current control instant, x, y (m), heading (rad)."""
-        from magenv.trajectories import Trajectory
-
-        w = self.world
-        return Trajectory(float(w.duration_s[row]), w.coefficients[row]).at(float(w.time_s()[row]))

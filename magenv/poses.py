@@ -139,6 +139,18 @@ def pose_bounds(system: System) -> tuple[Floats, Floats]:
     return np.tile(low, system.n_epm), np.tile(high, system.n_epm)
 
 
+@kernel
+def _to_epms(poses: Floats, epms: Floats) -> None:
+    for i in range(len(poses)):
+        pose_to_epm(poses[i], epms[i])
+
+
+@kernel
+def _to_poses(epms: Floats, poses: Floats) -> None:
+    for i in range(len(epms)):
+        epm_to_pose(epms[i], poses[i])
+
+
 def _as_rows(values: ArrayLike, width: int, name: str, must_be: str) -> Floats:
     array = np.ascontiguousarray(values, dtype=np.float64)
     require(array.ndim >= 1 and array.shape[-1] > 0 and array.shape[-1] % width == 0, name, must_be, array.shape)
@@ -156,8 +168,7 @@ def to_cartesian(pose: ArrayLike) -> tuple[Floats, Floats]:
     array = _as_rows(pose, POSE_SIZE, "pose", "an array of shape (..., 5 N)")
     rows = array.reshape(-1, POSE_SIZE)
     epms = np.empty((len(rows), 6))
-    for row, epm in zip(rows, epms, strict=True):
-        pose_to_epm(row, epm)
+    _to_epms(rows, epms)
     epms = epms.reshape(*array.shape[:-1], -1, 6)
     return epms[..., :3].copy(), epms[..., 3:].copy()
 
@@ -169,8 +180,7 @@ def from_cartesian(positions: ArrayLike, directions: ArrayLike) -> Floats:
     require(centres.shape == moments.shape, "directions", f"of the shape of positions {centres.shape}", moments.shape)
     epms = np.concatenate([centres, moments], axis=-1).reshape(-1, 6)
     poses = np.empty((len(epms), POSE_SIZE))
-    for epm, row in zip(epms, poses, strict=True):
-        epm_to_pose(epm, row)
+    _to_poses(epms, poses)
     return poses.reshape(*centres.shape[:-2], -1)
 
 

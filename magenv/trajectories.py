@@ -35,6 +35,11 @@ _RANDOM_RADIUS_M = 0.082
 _RANDOM_SPEED_MIN_MPS = 2e-4
 _RANDOM_TURN_MAX_RADPS = 0.1
 
+# Interpolation is linear in the knots: this matrix (32 segments x 4 ascending powers, 33 knots) is SciPy's spline.
+_SPLINE: Floats = (
+    CubicSpline(np.arange(SEGMENTS + 1), np.eye(SEGMENTS + 1)).c[::-1].transpose(1, 0, 2).reshape(-1, SEGMENTS + 1)
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -46,9 +51,8 @@ class Trajectory:
     @classmethod
     def through(cls, duration_s: float, knots: Floats) -> Trajectory:
         """Return the twice continuously differentiable spline through ``knots`` (33, 2, 3), equally spaced in time."""
-        spline = CubicSpline(np.linspace(0.0, 1.0, SEGMENTS + 1) * SEGMENTS, knots)
-        ascending = spline.c[::-1]  # (power, segment, robot, coordinate)
-        return cls(duration_s, np.ascontiguousarray(ascending.transpose(2, 1, 3, 0)))
+        coefficients = (_SPLINE @ knots.reshape(SEGMENTS + 1, 6)).reshape(SEGMENTS, 4, 2, 3)
+        return cls(duration_s, np.ascontiguousarray(coefficients.transpose(2, 0, 3, 1)))
 
     def at(self, time_s: float) -> Floats:
         """Return x, y (m) and heading (rad, not wrapped) of both robots (2, 3), held before the start and past the end."""
@@ -67,6 +71,13 @@ def reference_kernel(coefficients: Floats, duration: float, time: float, out: Fl
         for axis in range(3):
             c = coefficients[robot, segment, axis]
             out[robot, axis] = c[0] + u * (c[1] + u * (c[2] + u * c[3]))
+
+
+@kernel
+def reference_rows(coefficients: Floats, duration: Floats, time: Floats, out: Floats) -> None:
+    """Write the references (n, 2, 3) of n trajectories at their times (n,)."""
+    for i in range(len(out)):
+        reference_kernel(coefficients[i], duration[i], time[i], out[i])
 
 
 def _along_path(positions: Floats, velocities: Floats, flip_second: bool) -> Floats:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.dynamics import TOUCH, WALL, Physics, advance
+from magenv.dynamics import TOUCH, WALL, Physics, advance, drag_factors
 from magenv.kernels import kernel
 from magenv.params import Plant, System, TaskParams
-from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel
+from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel, reference_rows
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Measurements:
     heading_error_end_rad: Floats
     separation_min_m: Floats
     separation_tracked_m: Floats
-    """Separation at the last substep of the episode at which both robots tracked; NaN before the first."""
+    """Separation at the last instant of the episode at which both robots tracked; NaN where they never did."""
     substeps: NDArray[np.int64]
     """Substeps taken in the hold: fewer than a whole hold's where control was lost."""
     loss: NDArray[np.int64]
@@ -78,12 +78,13 @@ def _hold(
     tracked: float,
 ) -> tuple[float, float, float, float, float, float, int, int]:
     """Hold a command for one control period or until control is lost; return the fields of ``Measurements``."""
-    force, reference = np.empty((2, 3)), np.empty((2, 3))
+    force, reference, factors = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3, 2))
+    drag_factors(physics, row, h, factors)
     position_sum, heading_sum, nearest = 0.0, 0.0, math.inf
     position_error, heading_error, loss, done = 0.0, 0.0, 0, 0
     while done < substeps and loss == 0:
         move_epms(epms, targets)
-        contact = advance(robots, epms, physics, row, h, force)
+        contact = advance(robots, epms, physics, row, h, factors, force)
         done += 1
         reference_kernel(coefficients, duration, start + done * h, reference)
         first = math.hypot(robots[0, 0] - reference[0, 0], robots[0, 1] - reference[0, 1])
@@ -194,7 +195,9 @@ class World:
         self.coefficients[row] = trajectory.coefficients
         self.duration_s[row] = trajectory.duration_s
         self.step_count[row] = 0
-        self.measurements.separation_tracked_m[row] = np.nan
+        away = np.hypot(*(robots[:, :2] - trajectory.at(0.0)[:, :2]).T)
+        apart = float(np.hypot(*(robots[1, :2] - robots[0, :2])))
+        self.measurements.separation_tracked_m[row] = apart if away.max() <= self._tracking_distance else np.nan
 
     def step(self, targets: Floats, active: NDArray[np.bool_]) -> Measurements:
         """Hold the commanded EPMs (n, N, 6) for one control period in every active row.
@@ -230,6 +233,12 @@ class World:
     def time_s(self) -> Floats:
         """Return the time of the current control instant (n,) in s."""
         return self.step_count * self.period_s
+
+    def references(self) -> Floats:
+        """Return the references (n, 2, 3) at the current control instants: x, y (m), heading (rad)."""
+        out = np.empty((len(self.robots), 2, 3))
+        reference_rows(self.coefficients, self.duration_s, self.time_s(), out)
+        return out
 
     def ended(self) -> NDArray[np.bool_]:
         """Return where the reference has come to its end."""

@@ -1,0 +1,154 @@
+"""The Gymnasium environment: one episode at a time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.actions import ActionMode
+from magenv.episodes import Episodes, Settings
+from magenv.params import require
+from magenv.render import RENDER_FPS, Renderer, scene_of
+from magenv.task import Frame, ObservationMode
+
+_ACTIVE = np.ones(1, np.bool_)
+
+
+class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Two magnetic capsule robots in a plane, moved by two or three external permanent magnets (EPMs).
+
+    ## Description
+    Each robot carries a small magnet (IPM). The EPMs' poses are the only control; they pull and turn both robots at
+    once, and the robots attract or repel each other. The task is to make both follow a reference in position and
+    heading, side by side, ever closer. The system is that of Davy et al., "Independent Control of Two Magnetic Robots
+    using External Permanent Magnets: A Feasibility Study" (2023).
+
+    ## Action space
+    ``Box(-1, 1, (5 N,), float32)``, N = number of EPMs; per EPM azimuth, elevation, radius of its centre, azimuth and
+    elevation of its moment.
+
+    | ``action`` | meaning of -1 .. 1 |
+    |---|---|
+    | ``home`` (default) | offset from the home configuration in the frame carried by the robots: angles -1.2 .. 1.2 rad; radius from r_min = 0.15 m over 0.2 m (0) to 0.35 m |
+    | ``pose`` | absolute pose, global frame: azimuths -pi .. pi, elevations -pi/2 .. pi/2, radius 0.15 .. 0.5 m |
+    | ``step`` | change of the present pose: angles -0.3 .. 0.3 rad, radius -50 .. 50 mm |
+    | ``wrench`` | ``Box(-1, 1, (6,))``: F_x, F_y (20 mN), tau_z (1 mN m) per robot, global frame, turned into poses by ``magenv.allocation`` |
+
+    EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart;
+    ``info["projected"]`` says so.
+
+    ## Observation space
+    ``Box(float32)``, finite bounds: pose errors first, then what makes the task Markov; the table is in
+    ``magenv.task``, and ``magenv.task.unpack(observation, env.unwrapped.layout)`` names the parts in SI units.
+    ``observation="errors"`` gives the pose errors (8) alone.
+
+    ## Rewards
+    Mean of two terms in [0, 1], ``info["reward_position"]`` and ``info["reward_heading"]``, of the mean errors over the
+    hold; see ``magenv.task``. Success is measured apart from it.
+
+    ## Starting state
+    On the reference, at rest, with an offset of 1 mm and 3 degrees standard deviation; EPMs at home.
+
+    ## Episode end
+    *Terminated* where control is lost: a robot over 30 mm from its reference, bodies touching, or the wall reached
+    (``info["loss"]`` is a code into ``magenv.world.LOSSES``). *Truncated* at the end of the reference (100 s).
+    ``info["is_success"]`` at the end says whether control was kept.
+
+    ## Arguments
+    | name | default | |
+    |---|---|---|
+    | ``scenario`` | ``random`` | ``random`` (training family), ``approach-<s>``, ``approach-<s>-anti``, s in mm |
+    | ``plant`` | ``paper`` | EPMs jump to their commanded poses, no noise |
+    | ``n_epm`` | 2 | 2 or 3 |
+    | ``action`` | ``home`` | see above |
+    | ``observation`` | ``full`` | ``full`` or ``errors`` |
+    | ``frame`` | ``robots`` | frame of the observation: ``robots`` or ``global`` |
+    | ``control_hz`` | 2.0 | control rate |
+    | ``render_mode`` | None | ``human`` or ``rgb_array`` |
+
+    ## Version history
+    * v0: first version.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}
+
+    def __init__(
+        self,
+        scenario: str = "random",
+        plant: str = "paper",
+        n_epm: int = 2,
+        action: ActionMode = "home",
+        observation: ObservationMode = "full",
+        frame: Frame = "robots",
+        control_hz: float = 2.0,
+        render_mode: str | None = None,
+    ) -> None:
+        modes = self.metadata["render_modes"]
+        require(render_mode in (None, *modes), "render_mode", "None, " + ", ".join(modes), render_mode)
+        self.render_mode = render_mode
+        self._episodes = Episodes(1, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
+        self.layout = self._episodes.layout
+        self.observation_space = self._episodes.observation_space
+        self.action_space = self._episodes.action_space
+        self._running = False
+        self._renderer: Renderer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode; the same seed gives the same episode, bit for bit."""
+        super().reset(seed=seed)
+        self._episodes.start(0, self.np_random)
+        self._running = True
+        if self._renderer is not None:
+            self._renderer.restart()
+        if self.render_mode == "human":
+            self.render()
+        return self._episodes.observe()[0], _single(self._episodes.state_info())
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Command the EPMs for one control period.
+
+        Raises
+        ------
+        ValueError
+            If the action has the wrong shape or is not finite; nothing has moved then.
+        RuntimeError
+            If no episode is running.
+        """
+        if not self._running:
+            raise RuntimeError("No episode is running; call reset() before step().")
+        reward, terminated, truncated = self._episodes.step(np.asarray(action)[None], _ACTIVE)
+        info = _single(self._episodes.state_info() | self._episodes.step_info())
+        ended = bool(terminated[0] or truncated[0])
+        if ended:
+            self._running = False
+            info["is_success"] = bool(truncated[0])
+        if self.render_mode == "human":
+            self.render()
+        return self._episodes.observe()[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the scene: return an RGB array (h, w, 3), or show a window and return None."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array' given to gymnasium.make.")
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer(self._episodes.system, self._episodes.plant, self.render_mode == "human")
+        return self._renderer.draw(scene_of(self._episodes.world, 0))
+
+    def close(self) -> None:
+        """Close the window; may be called again."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def _single(info: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the first row of every array, numbers as Python's."""
+    return {name: value[0].item() if value.ndim == 1 else value[0].copy() for name, value in info.items()}

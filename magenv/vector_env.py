@@ -1,0 +1,162 @@
+"""The batched environment: many episodes in one call, equal to the scalar environment bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from magenv.actions import ActionMode
+from magenv.episodes import Bools, Episodes, Settings
+from magenv.params import require
+from magenv.render import RENDER_FPS, Renderer, scene_of
+from magenv.task import Frame, ObservationMode
+
+Observations = NDArray[np.float32]
+Rewards = NDArray[np.float64]
+
+
+class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+    """``num_envs`` environments of ``magenv.env.TwoRobots`` in one; see there for the task and its arguments.
+
+    Episode ``i`` behaves as a scalar environment reset with the ``i``-th seed and then without seeds.
+
+    Parameters
+    ----------
+    num_envs : int
+        Number of episodes side by side.
+    autoreset_mode : AutoresetMode or str
+        ``NextStep``: an ended episode begins anew at the next step, whose action is ignored. ``SameStep``: it begins
+        anew at once; ``info["final_obs"]`` and ``info["final_info"]`` hold its end. ``Disabled``: the caller resets
+        with ``options={"reset_mask": ...}``.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str = "random",
+        plant: str = "paper",
+        n_epm: int = 2,
+        action: ActionMode = "home",
+        observation: ObservationMode = "full",
+        frame: Frame = "robots",
+        control_hz: float = 2.0,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        whole = isinstance(num_envs, int) and not isinstance(num_envs, bool) and num_envs >= 1
+        require(whole, "num_envs", "a whole number of at least 1", num_envs)
+        require(render_mode in (None, "rgb_array"), "render_mode", "None or rgb_array", render_mode)
+        known = [mode.value for mode in AutoresetMode]
+        value = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        require(value in known, "autoreset_mode", "one of " + ", ".join(known), autoreset_mode)
+        self.autoreset_mode = AutoresetMode(value)
+        self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self._episodes = Episodes(num_envs, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
+        self.layout = self._episodes.layout
+        self.single_observation_space = self._episodes.observation_space
+        self.single_action_space = self._episodes.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._ended: Bools = np.ones(num_envs, np.bool_)
+        self._renderers: list[Renderer] = []
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begin episodes, in all rows or where ``options["reset_mask"]`` says; row i takes seed + i, or the i-th."""
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
+        seeds = [None] * self.num_envs if seeds is None else list(seeds)
+        require(len(seeds) == self.num_envs, "seed", f"a whole number or {self.num_envs} of them", seed)
+        mask = np.ones(self.num_envs, np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            fits = mask.shape == (self.num_envs,) and mask.dtype == np.bool_ and bool(mask.any())
+            require(fits, "reset_mask", f"{self.num_envs} booleans, one of them true", options["reset_mask"])
+        for row in np.flatnonzero(mask):
+            if seeds[row] is not None:
+                self._rngs[row] = seeding.np_random(seeds[row])[0]
+        self._start(mask)
+        return self._episodes.observe(), _masked(self._episodes.state_info(), mask)
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Rewards, Bools, Bools, dict[str, Any]]:
+        """Command the EPMs of all episodes for one control period.
+
+        Raises
+        ------
+        ValueError
+            If the actions have the wrong shape or are not finite; nothing has moved then.
+        RuntimeError
+            If an episode has ended and was not reset (``Disabled``), or none has begun.
+        """
+        if any(rng is None for rng in self._rngs):
+            raise RuntimeError("No episodes are running; call reset() before step().")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
+            raise RuntimeError(f"Episodes {np.flatnonzero(self._ended).tolist()} have ended; reset them with a reset_mask.")
+        resetting = self._ended.copy()
+        active = ~resetting
+        reward, terminated, truncated = self._episodes.step(actions, active)
+        ended = terminated | truncated
+        if resetting.any():
+            self._start(resetting)
+        info = _masked(self._episodes.step_info(), active)
+        info |= _masked({"is_success": truncated.copy()}, ended)
+        self._ended = ended
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            if ended.any():
+                info = self._same_step(info, ended)
+        info |= _masked(self._episodes.state_info(), np.ones(self.num_envs, np.bool_))
+        return self._episodes.observe(), reward, terminated, truncated, info
+
+    def _same_step(self, info: dict[str, Any], ended: Bools) -> dict[str, Any]:
+        """Begin the ended episodes anew; return the info of the others, with the end of these beside it."""
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        observations = self._episodes.observe()
+        for row in np.flatnonzero(ended):
+            final_obs[row] = observations[row].copy()
+        values = {name: value for name, value in info.items() if not name.startswith("_")}
+        final = _masked({name: value.copy() for name, value in values.items()} | self._episodes.state_info(), ended)
+        values.pop("is_success")
+        self._start(ended)
+        return _masked(values, ~ended) | _masked({"final_obs": final_obs}, ended) | {"final_info": final, "_final_info": ended.copy()}
+
+    def _start(self, mask: Bools) -> None:
+        for row in np.flatnonzero(mask):
+            rng = self._rngs[row]
+            if rng is None:
+                rng = self._rngs[row] = seeding.np_random(None)[0]
+            self._episodes.start(int(row), rng)
+        self._ended[mask] = False
+        for row, renderer in enumerate(self._renderers):
+            if mask[row]:
+                renderer.restart()
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """Return one RGB array (h, w, 3) per episode."""
+        if self.render_mode is None:
+            return None
+        if not self._renderers:
+            for _ in range(self.num_envs):
+                self._renderers.append(Renderer(self._episodes.system, self._episodes.plant, window=False))
+        frames = [r.draw(scene_of(self._episodes.world, row)) for row, r in enumerate(self._renderers)]
+        return tuple(frame for frame in frames if frame is not None)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the renderers."""
+        for renderer in self._renderers:
+            renderer.close()
+        self._renderers = []
+
+
+def _masked(values: dict[str, NDArray[Any]], mask: Bools) -> dict[str, Any]:
+    """Return the values with Gymnasium's ``_name`` masks beside them."""
+    return values | {f"_{name}": mask.copy() for name in values}
