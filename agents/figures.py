@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from agents.metrics import group, typical
+from agents.metrics import by_controller, typical
 from agents.records import Record
 from magenv.params import PLANTS
 
@@ -66,7 +66,7 @@ def png(figure: Figure) -> bytes:
 
 def paths(records: list[Record]) -> Figure:
     """Draw the paths of both robots on one scenario, a panel per controller, the typical episode bold."""
-    groups = _by_controller(records)
+    groups = by_controller(records)
     columns = min(3, len(groups)) if len(groups) != 4 else 2
     rows = math.ceil(len(groups) / columns)
     figure = _figure(0.6 + 4.2 * columns, 1.0 + 4.3 * rows)
@@ -94,7 +94,7 @@ def paths(records: list[Record]) -> Figure:
         Line2D([], [], color="#555555", linewidth=2.0, label="typical episode, with headings"),
         Line2D([], [], color="#555555", linewidth=0.8, alpha=0.4, label="other episodes"),
         Line2D([], [], color=_INK, marker="x", markersize=8, markeredgewidth=2, linestyle="", label="control lost"),
-        Line2D([], [], color=_INK, marker="o", fillstyle="none", linestyle="", label="wall"),
+        Line2D([], [], color=_INK, linewidth=1.2, label="wall"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(5, 2 + columns), frameon=False, fontsize=9)
     return figure
@@ -162,7 +162,7 @@ def separation(records: list[Record]) -> Figure:
 
 def _over_time(axes: Axes, records: list[Record], series: Callable[[Record], tuple[Floats, Floats]]) -> None:
     """Draw each controller's median and the band of its episodes, while at least half of them are under control."""
-    groups = _by_controller(records)
+    groups = by_controller(records)
     for name, episodes in groups.items():
         colour = colour_of(name, list(groups))
         drawn = [series(episode) for episode in episodes]
@@ -188,23 +188,19 @@ def _over_time(axes: Axes, records: list[Record], series: Callable[[Record], tup
 
 
 def _time_legend(figure: Figure, records: list[Record], more: list[Line2D]) -> None:
-    groups = _by_controller(records)
+    groups = by_controller(records)
     handles = [
         Line2D([], [], color=colour_of(name, list(groups)), linewidth=2, label=f"{name}: {outcome(episodes)}")
         for name, episodes in groups.items()
     ]
     handles += [
         *more,
-        Line2D([], [], color=_INK, marker="x", linestyle="", label="control lost (one mark per episode)"),
+        Line2D([], [], color=_INK, marker="x", linestyle="", label="control lost (each episode)"),
     ]
     note = "line: median; band: 10 to 90 % of the episodes; both while at least half of them are under control"
     figure.legend(
         handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9, title=note, title_fontsize=9
     )
-
-
-def _by_controller(records: list[Record]) -> dict[str, list[Record]]:
-    return {name: episodes for (name, _), episodes in group(records).items()}
 
 
 def _title(records: list[Record]) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, bootstrap
 
 from agents.records import Record
+from magenv.params import require
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -106,17 +107,34 @@ def measure(record: Record) -> Episode:
     )
 
 
-def group(records: list[Record]) -> dict[tuple[str, str], list[Record]]:
-    """Return the records by (controller, scenario), in order of appearance."""
-    groups: dict[tuple[str, str], list[Record]] = {}
+def by_scenario(records: list[Record]) -> dict[str, list[Record]]:
+    """Return the records of each scenario, in order of appearance."""
+    groups: dict[str, list[Record]] = {}
     for record in records:
-        groups.setdefault((record.controller, record.scenario), []).append(record)
+        groups.setdefault(record.scenario, []).append(record)
+    return groups
+
+
+def by_controller(records: list[Record]) -> dict[str, list[Record]]:
+    """Return the records of each controller, in order of appearance."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(record.controller, []).append(record)
     return groups
 
 
 def summarise(records: list[Record]) -> list[Summary]:
-    """Return one row per controller and scenario; the records share plant, number of EPMs and control rate."""
-    return [_summary(group_records) for group_records in group(records).values()]
+    """Return one row per scenario and controller.
+
+    The records share plant, number of EPMs and control rate; there is one per controller, scenario and seed.
+    """
+    keys = [(record.controller, record.scenario, record.seed) for record in records]
+    twice = [key for key in dict.fromkeys(keys) if keys.count(key) > 1]
+    require(not twice, "records", "one per controller, scenario and seed", twice)
+    rows = []
+    for of_scenario in by_scenario(records).values():
+        rows += [_summary(episodes) for episodes in by_controller(of_scenario).values()]
+    return rows
 
 
 def _summary(records: list[Record]) -> Summary:

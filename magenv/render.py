@@ -35,6 +35,7 @@ _DARK: tuple[Colour, Colour] = ((0, 58, 105), (140, 88, 0))
 _LIGHT: tuple[Colour, Colour] = ((140, 196, 228), (246, 212, 132))
 _INK, _GREY, _GRID, _PAPER, _WHITE = (40, 40, 46), (120, 120, 128), (232, 232, 236), (244, 244, 246), (255, 255, 255)
 _NORTH, _SOUTH, _ALARM = (196, 40, 52), (250, 250, 250), (164, 20, 36)
+_GRID_M = 0.020
 _TURN = np.linspace(0.5 * math.pi, 2.5 * math.pi, 32)
 """Angles round a cap, its back half first."""
 _LOSS_WORDS = {
@@ -134,7 +135,9 @@ class _Canvas:
 
         self._draw = pygame.draw
         pygame.font.init()
-        self._fonts = {height: pygame.font.Font(None, height) for height in (18, 21, 26)}
+        self._shrink = pygame.transform.smoothscale_by
+        # Twice as large and shrunk: the letters of small fonts stand on whole pixels, unevenly.
+        self._fonts = {height: pygame.font.Font(None, 2 * height) for height in (18, 21, 26)}
         # Bytes in the order of an RGB array, so that reading the picture is a plain copy.
         self.surface: Surface = pygame.Surface(size, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
 
@@ -152,8 +155,11 @@ class _Canvas:
         self.surface.fill(colour, box)
 
     def line(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
-        """Draw a polyline (n, 2)."""
-        self._draw.lines(self.surface, colour, False, np.asarray(points), width)
+        """Draw a polyline (n, 2), smooth if it is one pixel wide."""
+        if width == 1:
+            self._draw.aalines(self.surface, colour, False, np.asarray(points))
+        else:
+            self._draw.lines(self.surface, colour, False, np.asarray(points), width)
 
     def arrow(self, start: Floats, end: Floats, colour: Colour, width: float) -> None:
         """Draw an arrow with a filled head; nothing where it would be shorter than its head."""
@@ -168,11 +174,9 @@ class _Canvas:
         sides = [(start, 0.5), (neck, 0.5), (neck, 1.5), (end, 0.0), (neck, -1.5), (neck, -0.5), (start, -0.5)]
         self.polygon(np.array([at + side * width * across for at, side in sides]), colour)
 
-    def text(
-        self, words: str, at: ArrayLike, colour: Colour = _INK, height: int = 21, anchor: str = "midleft"
-    ) -> None:
+    def text(self, words: str, at: ArrayLike, colour: Colour = _INK, height: int = 21, anchor: str = "midleft") -> None:
         """Write words whose ``anchor``, a pygame rectangle's name of a point, is ``at``."""
-        image = self._fonts[height].render(words, True, colour)
+        image = self._shrink(self._fonts[height].render(words, True, colour), 0.5)
         x, y = np.asarray(at)
         self.surface.blit(image, image.get_rect(**{anchor: (round(x), round(y))}))
 
@@ -229,7 +233,7 @@ class Renderer:
         self._trail_time_s = math.nan
 
     def draw(self, scene: Scene) -> NDArray[np.uint8] | None:
-        """Return the picture (h, w, 3); with a window, show it there and return None, or do nothing once it is closed."""
+        """Return the picture (h, w, 3), its left square the workspace; with a window, show it there and return None."""
         import pygame
 
         if self._window:
@@ -248,7 +252,7 @@ class Renderer:
             pygame.display.quit()
 
     def _show(self, scene: Scene) -> None:
-        """Show the scene in the window, if nobody has closed it: the user, or another renderer, for there is but one."""
+        """Show the scene, unless the user has closed the window, or another renderer has: there is but one."""
         import pygame
 
         shown = pygame.display.get_surface() if self._open else None
@@ -275,15 +279,15 @@ class Renderer:
             trails = zoom.px(self._trail)
             for robot in range(2):
                 canvas.line(trails[:, robot], _LIGHT[robot], 3)
-        for robot in range(2):
-            canvas.line(zoom.px([scene.robots[robot, :2], scene.reference[robot, :2]]), _DARK[robot], 2)
-            self._draw_robot(zoom, scene.robots[robot], robot)
         apart = scene.robots[0, :2] - scene.robots[1, :2]
         apart = 2.2 * self._radius * apart / max(float(np.hypot(*apart)), self._radius)
-        for robot, side in ((0, 1), (1, -1)):
+        for robot, away in ((0, apart), (1, -apart)):
+            position, reference = scene.robots[robot], scene.reference[robot]
+            canvas.text(str(robot + 1), zoom.px(position[:2] + away), _DARK[robot], 26, "center")
+            canvas.line(zoom.px([position[:2], reference[:2]]), _DARK[robot])
+            self._draw_robot(zoom, position, robot)
+        for robot in range(2):
             self._draw_reference(zoom, scene.reference[robot], robot)
-            at = zoom.px(scene.robots[robot, :2] + side * apart)
-            canvas.text(str(robot + 1), at, _DARK[robot], 26, "center")
         self._draw_readings(scene)
         self._draw_strip(scene)
 
@@ -291,7 +295,7 @@ class Renderer:
         """Draw body, magnet and heading of a robot at ``pose`` (3,)."""
         canvas, along = self._canvas, _direction(pose[2])
         ends = view.px(pose[:2] + self._radius * np.array([[0.8], [2.4]]) * along)
-        canvas.arrow(ends[0], ends[1], ROBOT_COLOURS[robot], 0.5 * self._radius * view.scale)
+        canvas.arrow(ends[0], ends[1], ROBOT_COLOURS[robot], 0.3 * self._radius * view.scale)
         canvas.disc(view.px(pose[:2]), self._radius * view.scale, ROBOT_COLOURS[robot])
         axes = np.array([along, [-along[1], along[0]]])
         for pole, colour in ((1.0, _NORTH), (-1.0, _SOUTH)):
@@ -312,16 +316,16 @@ class Renderer:
         canvas.rectangle((16, 40, 176, 8), _GRID)
         canvas.rectangle((16, 40, done, 8), _GREY)
         readings = (
-            ("position error", f"{1e3 * scene.position_error_m:.1f} mm"),
-            ("heading error", f"{math.degrees(scene.heading_error_rad):.1f}\N{DEGREE SIGN}"),
+            ("mean position error", f"{1e3 * scene.position_error_m:.1f} mm"),
+            ("mean heading error", f"{math.degrees(scene.heading_error_rad):.1f}\N{DEGREE SIGN}"),
             ("separation", f"{1e3 * scene.separation_m:.1f} mm"),
         )
         for row, (name, value) in enumerate(readings):
-            canvas.text(name, (_SIDE_PX - 86, 24 + 22 * row), _GREY, anchor="midright")
+            canvas.text(name, (_SIDE_PX - 92, 24 + 22 * row), _GREY, anchor="midright")
             canvas.text(value, (_SIDE_PX - 16, 24 + 22 * row), anchor="midright")
         if scene.loss:
             middle = _SIDE_PX / 2
-            canvas.rectangle((round(middle) - 170, 6, 340, 52), _ALARM)
+            canvas.rectangle((round(middle) - 155, 6, 310, 52), _ALARM)
             canvas.text("CONTROL LOST", (middle, 22), _WHITE, 26, "center")
             canvas.text(_LOSS_WORDS[LOSSES[scene.loss]], (middle, 44), _WHITE, anchor="center")
 
@@ -340,10 +344,10 @@ class Renderer:
                 canvas.disc(view.px([x, y if vertical == 1 else 0.0]), self._radius * view.scale, ROBOT_COLOURS[robot])
             for k, centre in enumerate(scene.epm_positions):
                 canvas.disc(view.px(centre[[0, vertical]]), 8, _INK)
-                canvas.text("ABC"[k], view.px(centre[[0, vertical]]), _WHITE, 18, "center")
+                canvas.text(chr(ord("A") + k), view.px(centre[[0, vertical]]), _WHITE, 18, "center")
         for k, (centre, moment) in enumerate(zip(scene.epm_positions, scene.epm_directions, strict=True)):
             y = 60 + 2 * _PANEL_PX + 32 + 18 * k
-            canvas.text("ABC"[k], (_SIDE_PX + 40, y), anchor="center")
+            canvas.text(chr(ord("A") + k), (_SIDE_PX + 40, y), anchor="center")
             canvas.text(f"{1e3 * centre[2]:+.0f} mm", (_SIDE_PX + 190, y), anchor="midright")
             elevation = math.degrees(math.asin(min(max(moment[2], -1.0), 1.0)))
             canvas.text(f"{elevation:+.0f}\N{DEGREE SIGN}", (_SIDE_PX + 340, y), anchor="midright")
@@ -365,7 +369,7 @@ class Renderer:
         ends = [(_NORTH, 0.0, 1.0), (_SOUTH, -1.0, 0.0)]
         edge = _pale(_INK) if pale else _INK
         near = 1.0 if toward >= 0 else -1.0
-        arrow = view.px([centre, centre + (half_length + 0.07) * axis])
+        arrow = view.px([centre + half_length * axis, centre + (half_length + 0.1) * axis])
         if near < 0:
             canvas.arrow(arrow[0], arrow[1], edge, 3.5)
         for colour, low, high in ends[:: -int(near)]:  # the pole nearer to the viewer comes last
@@ -384,8 +388,8 @@ class Renderer:
             points = self._zoom.px(path[:, robot])
             lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
             dots = np.arange(0.0, lengths[-1], 9.0)
-            for x, y in zip(np.interp(dots, lengths, points[:, 0]), np.interp(dots, lengths, points[:, 1]), strict=True):
-                canvas.disc(np.array([x, y]), 1.5, colour)
+            for dot in np.stack([np.interp(dots, lengths, points[:, axis]) for axis in range(2)], axis=-1):
+                canvas.disc(dot, 1.5, colour)
         self._path_backdrop = canvas.surface.copy()
 
     def _draw_backdrop(self) -> None:
@@ -395,21 +399,30 @@ class Renderer:
         canvas.rectangle((_SIDE_PX, 0, _STRIP_PX, _SIDE_PX), _PAPER)
         canvas.disc(zoom.px([0, 0]), self._wall * zoom.scale + 5, _GREY)
         canvas.disc(zoom.px([0, 0]), self._wall * zoom.scale, _WHITE)
-        for at in np.arange(-0.08, 0.081, 0.02):
+        lines = int(self._wall / _GRID_M)
+        for at in _GRID_M * np.arange(-lines, lines + 1):
             reach = math.sqrt(max(self._wall**2 - at**2, 0.0))
             canvas.line(zoom.px([[at, -reach], [at, reach]]), _GRID)
             canvas.line(zoom.px([[-reach, at], [reach, at]]), _GRID)
-        canvas.text("workspace from above, x to the right, y up", (_SIDE_PX / 2, 24), _GREY, anchor="center")
-        self._draw_scale(zoom, (_SIDE_PX - 20, _SIDE_PX - 22), 0.02)
+        canvas.text("workspace from above", (_SIDE_PX / 2, 24), _GREY, anchor="center")
+        self._draw_scale(zoom, (_SIDE_PX - 20, _SIDE_PX - 16), _GRID_M)
+        self._draw_axes((_SIDE_PX - 70, _SIDE_PX - 50), "xy")
         middle = _SIDE_PX + _STRIP_PX / 2
-        for view, title in ((self._above, "all from above (pale: below the plane)"), (self._beside, "all from the side, z up")):
+        panels = (
+            (self._above, "xy", "external magnets from above (pale: under the plane)"),
+            (self._beside, "xz", "external magnets from the side (looking along y)"),
+        )
+        for view, axes, title in panels:
             top = round(view.origin_px[1] - _PANEL_PX / 2)
             canvas.text(title, (middle, top - 14), anchor="center")
             canvas.rectangle((_SIDE_PX + 10, top, _STRIP_PX - 20, _PANEL_PX), _WHITE)
-            self._draw_scale(view, (_SIDE_PX + _STRIP_PX - 20, top + _PANEL_PX - 14), 0.2)
+            self._draw_scale(view, (_SIDE_PX + _STRIP_PX - 20, top + _PANEL_PX - 10), 0.2)
+            self._draw_axes((_SIDE_PX + 22, top + _PANEL_PX - 12), axes)
         canvas.disc(self._above.px([0, 0]), self._wall * self._above.scale, _GREY, 2)
-        canvas.line(self._beside.px([[-self._wall, 0], [self._wall, 0]]), _GREY, 3)
-        for x, words in ((40, "EPM"), (150, "height"), (300, "elevation of moment")):
+        plane = self._beside.px([[-self._wall, 0], [self._wall, 0]])
+        canvas.line(plane, _GREY, 3)
+        canvas.text("plane", plane[1] + [8, 0], _GREY, 18)
+        for x, words in ((40, "magnet"), (150, "height"), (300, "elevation of moment")):
             canvas.text(words, (_SIDE_PX + x, 60 + 2 * _PANEL_PX + 14), _GREY, anchor="center")
         self._draw_legend()
 
@@ -423,20 +436,26 @@ class Renderer:
     def _draw_legend(self) -> None:
         """Explain the marks in the lower left corner."""
         canvas = self._canvas
-        rows = ("robots 1 and 2", "their references", "reference paths", "trails", "magnets, N red")
-        top = _SIDE_PX - 22 * len(rows) - 4
+        rows = ("trails", "robots", "references now", "reference paths", "magnet poles")
+        top = _SIDE_PX - 22 * len(rows) + 2
         for row, words in enumerate(rows):
-            y = top + 22 * row
-            canvas.text(words, (92, y))
-            for robot in range(2):
-                view = _View((20.0 + 38 * robot, y), 0.4 * self._zoom.scale)
-                if row == 0:
-                    self._draw_robot(view, np.zeros(3), robot)
-                elif row == 1:
-                    self._draw_reference(view, np.zeros(3), robot)
-                elif row == 2:
-                    for x in (0.0, 9.0, 18.0):
-                        canvas.disc(np.array([16.0 + 38 * robot + x, y]), 1.5, ROBOT_COLOURS[robot])
-                elif row == 3:
-                    canvas.line([[14 + 38 * robot, y], [38 + 38 * robot, y]], _LIGHT[robot], 3)
-        x, y = 26, top + 22 * (len(rows) - 1)
+            canvas.text(words, (86, top + 22 * row))
+        for robot, colour in enumerate(ROBOT_COLOURS):
+            x = 14 + 34 * robot
+            views = [_View((x + 6, top + 22 * row), 0.4 * self._zoom.scale) for row in (1, 2)]
+            canvas.line([[x, top], [x + 24, top]], _LIGHT[robot], 3)
+            self._draw_robot(views[0], np.zeros(3), robot)
+            self._draw_reference(views[1], np.zeros(3), robot)
+            for dot in (3.0, 12.0, 21.0):
+                canvas.disc(np.array([x + dot, top + 66]), 1.5, colour)
+        for left, pole, colour, ink in ((14, "S", _SOUTH, _INK), (43, "N", _NORTH, _WHITE)):
+            canvas.rectangle((left, top + 80, 29, 16), _INK)
+            canvas.rectangle((left + 1, top + 81, 27, 14), colour)
+            canvas.text(pole, (left + 15, top + 89), ink, 18, "center")
+
+    def _draw_axes(self, origin: tuple[float, float], names: str) -> None:
+        """Draw two named arrows, to the right and up, from ``origin`` (px)."""
+        start = np.array(origin)
+        for name, way in zip(names, ([1.0, 0.0], [0.0, -1.0]), strict=True):
+            self._canvas.arrow(start, start + 26 * np.array(way), _GREY, 2.0)
+            self._canvas.text(name, start + 34 * np.array(way), _GREY, 18, "center")

@@ -1,0 +1,44 @@
+"""The controllers that ``evaluate.py`` knows by name: classical ones and the agents that ship with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from agents.baseline import paper_baseline, tuned_baseline
+from agents.controller import Controller, Idle, Random
+from agents.learned import Learned
+from agents.store import CARD
+from magenv.params import require
+
+_SHIPPED = Path(__file__).parent / "data"
+_CLASSICAL = ("baseline", "tuned", "idle", "random")
+
+
+def names() -> list[str]:
+    """Return the known names, shipped agents last."""
+    return [*_CLASSICAL, *(folder.name for folder in sorted(_SHIPPED.glob("*")) if (folder / CARD).is_file())]
+
+
+def controller(name: str, n_epm: int = 2, control_hz: float = 2.0) -> Controller:
+    """Return the controller of this name, or the agent in this folder, for a number of EPMs and a control rate.
+
+    Raises
+    ------
+    ValueError
+        If neither is known, or an agent was made for something else.
+    """
+    match name:
+        case "baseline":
+            return paper_baseline(n_epm, control_hz)
+        case "tuned":
+            return tuned_baseline(n_epm, control_hz)
+        case "idle":
+            return Idle(n_epm)
+        case "random":
+            return Random(n_epm)
+    shipped = _SHIPPED / name
+    known = name in names()
+    require(known or (Path(name) / CARD).is_file(), "controller", f"one of {', '.join(names())} or a model's folder", name)
+    agent = Learned(shipped, name) if known else Learned(Path(name))
+    agent.check(n_epm, control_hz)
+    return agent

@@ -1,0 +1,93 @@
+"""Run controllers on the same episodes, then tell what came out: what both scripts end in."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from agents.controller import Controller
+from agents.records import Record
+from agents.report import check_output_dir, print_table, write_report
+from agents.rollout import run
+from magenv.params import PLANTS, choose, require
+from magenv.trajectories import check_scenario
+
+
+def compare(
+    controllers: Sequence[Controller],
+    scenarios: Sequence[str],
+    plant: str,
+    n_epm: int,
+    control_hz: float,
+    episodes: int,
+    seed: int,
+    out: Path,
+    command: str,
+) -> None:
+    """Run every controller on every scenario, print the table and write the report to ``out``.
+
+    Ctrl-C stops the runs; what has been measured until then is reported, and the interruption raised again.
+
+    Raises
+    ------
+    ValueError
+        If an argument is unsound or ``out`` cannot be written; nothing has run then.
+    """
+    names = [controller.name for controller in controllers]
+    require(len(controllers) > 0 and len(set(names)) == len(names), "controllers", "one or more, each once", names)
+    require(len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios)
+    for scenario in scenarios:
+        check_scenario(scenario)
+    choose(PLANTS, "plant", plant)
+    require(episodes >= 1, "episodes", "at least 1", episodes)
+    require(seed >= 0, "seed", "a whole number of at least 0", seed)
+    check_output_dir(out)
+    records: list[Record] = []
+    interrupted: KeyboardInterrupt | None = None
+    try:
+        _run_all(controllers, scenarios, plant, n_epm, control_hz, episodes, seed, records)
+    except KeyboardInterrupt as interruption:
+        interrupted = interruption
+    if records:
+        rows = write_report(records, out, command)
+        print_table(rows)
+        print(f"Report: {out / 'report.md'}")
+    if interrupted is not None:
+        raise interrupted
+
+
+def _run_all(
+    controllers: Sequence[Controller],
+    scenarios: Sequence[str],
+    plant: str,
+    n_epm: int,
+    control_hz: float,
+    episodes: int,
+    seed: int,
+    records: list[Record],
+) -> None:
+    """Append the records of all episodes to ``records`` as they end, with a progress bar."""
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("", total=len(controllers) * len(scenarios) * episodes)
+
+        def keep(record: Record) -> None:
+            records.append(record)
+            bar.advance(task)
+
+        for scenario in scenarios:
+            for controller in controllers:
+                bar.update(task, description=f"{controller.name} on {scenario}")
+                run(controller, scenario, plant, n_epm, control_hz, episodes, seed, keep)

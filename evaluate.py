@@ -1,0 +1,54 @@
+"""Run controllers on the same episodes and report: ``python evaluate.py --help``."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from agents.catalogue import controller, names
+from agents.command import command_line, friendly
+from agents.comparison import compare
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Run controllers on the same episodes; write summary.json, the episodes' records, figures and animations."""
+
+    controllers: tuple[str, ...] = ("baseline", "tuned", "ppo")
+    """Names (see --list) or folders of trained models."""
+    scenarios: tuple[str, ...] = ("approach-60", "approach-30")
+    """approach-<s>, approach-<s>-anti with s in mm, or random."""
+    plant: str = "paper"
+    """Plant acted on."""
+    n_epm: int = 2
+    """Number of external magnets, 2 or 3."""
+    control_hz: float = 2.0
+    """Control rate."""
+    episodes: int = 20
+    """Episodes per controller and scenario."""
+    seed: int = 0
+    """Of the first episode; the others follow."""
+    out: Path = Path("runs/evaluate")
+    """Folder of the report."""
+    list: bool = False
+    """Print the known controllers, one name a line, and stop."""
+
+
+def main() -> None:
+    """Evaluate, report."""
+    c = tyro.cli(EvaluateConfig, description=EvaluateConfig.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    if c.list:
+        print("\n".join(names()))
+        return
+    chosen = [controller(name, c.n_epm, c.control_hz) for name in c.controllers]
+    compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, c.out, command_line())
+
+
+if __name__ == "__main__":
+    friendly(main)

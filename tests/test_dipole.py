@@ -1,0 +1,204 @@
+"""The dipole's laws against finite differences, closed forms and magpylib."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magenv.dipole import dipole_force_gradient, field, gradient
+from magenv.params import MU_0, Magnet, System
+
+Floats = NDArray[np.float64]
+
+MAGPYLIB_RTOL = 1e-8
+"""magpylib takes the measured vacuum permeability (CODATA), 1.3e-10 above 4 pi 1e-7."""
+
+
+@pytest.fixture
+def dipoles(rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Moments, sources and points (200, 3), 0.05 to 1 m apart in all directions."""
+    moments = rng.normal(0.0, 1.0, (200, 3)) * 10.0 ** rng.uniform(-1, 3, (200, 1))
+    sources = rng.normal(0.0, 0.2, (200, 3))
+    offsets = rng.normal(0.0, 1.0, (200, 3))
+    offsets *= rng.uniform(0.05, 1.0, (200, 1)) / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    return moments, sources, sources + offsets
+
+
+def rotations(rng: np.random.Generator, n: int) -> Floats:
+    q, r = np.linalg.qr(rng.normal(size=(n, 3, 3)))
+    q *= np.sign(np.diagonal(r, axis1=-2, axis2=-1))[:, None, :]
+    q[..., 0] *= np.linalg.det(q)[:, None]
+    return q
+
+
+def test_field_on_axis_and_on_the_equator() -> None:
+    m, d = 925.0, 0.2
+    k = MU_0 / (4 * np.pi)
+    np.testing.assert_allclose(field([0, 0, m], [0, 0, 0], [0, 0, d]), [0, 0, 2 * k * m / d**3], rtol=1e-14)
+    np.testing.assert_allclose(field([0, 0, m], [0, 0, 0], [0, 0, -d]), [0, 0, 2 * k * m / d**3], rtol=1e-14)
+    np.testing.assert_allclose(field([0, 0, m], [0, 0, 0], [d, 0, 0]), [0, 0, -k * m / d**3], rtol=1e-14)
+
+
+def test_field_is_magpylibs(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    b = magpylib.func.dipole_field("B", points, moments, positions=sources)
+    h = magpylib.func.dipole_field("H", points, moments, positions=sources)
+    ours = field(moments, sources, points)
+    np.testing.assert_allclose(ours, b, rtol=MAGPYLIB_RTOL, atol=1e-14)
+    np.testing.assert_allclose(ours, MU_0 * h, rtol=MAGPYLIB_RTOL, atol=1e-14)
+    one = magpylib.misc.Dipole(moment=moments[0], position=sources[0])
+    np.testing.assert_allclose(ours[0], one.getB(points[0]), rtol=MAGPYLIB_RTOL)
+
+
+def test_gradient_is_the_derivative_of_the_field(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    distance = np.linalg.norm(points - sources, axis=-1)
+    h = 1e-5 * distance
+    numeric = np.empty((len(points), 3, 3))
+    for j in range(3):
+        step = h[:, None] * np.eye(3)[j]
+        numeric[:, :, j] = (field(moments, sources, points + step) - field(moments, sources, points - step)) / (
+            2 * h[:, None]
+        )
+    exact = gradient(moments, sources, points)
+    size = np.linalg.norm(exact, axis=(-2, -1))[:, None, None]
+    np.testing.assert_allclose(exact / size, numeric / size, atol=1e-8)
+
+
+def test_gradient_is_the_derivative_of_magpylibs_field(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    h = 1e-5 * np.linalg.norm(points - sources, axis=-1)[:, None]
+    numeric = np.stack(
+        [
+            (
+                magpylib.func.dipole_field("B", points + h * axis, moments, positions=sources)
+                - magpylib.func.dipole_field("B", points - h * axis, moments, positions=sources)
+            )
+            / (2 * h)
+            for axis in np.eye(3)
+        ],
+        axis=-1,
+    )
+    exact = gradient(moments, sources, points)
+    size = np.linalg.norm(exact, axis=(-2, -1))[:, None, None]
+    np.testing.assert_allclose(exact / size, numeric / size, atol=1e-7)
+
+
+def test_gradient_is_symmetric_and_traceless(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    g = gradient(*dipoles)
+    size = np.linalg.norm(g, axis=(-2, -1))
+    np.testing.assert_array_equal(g, np.swapaxes(g, -1, -2))
+    assert np.abs(np.trace(g, axis1=-2, axis2=-1) / size).max() < 1e-14
+
+
+def test_force_gradient_is_the_derivative_of_the_force(
+    dipoles: tuple[Floats, Floats, Floats], rng: np.random.Generator
+) -> None:
+    moments, sources, points = dipoles
+    for m, a, b in zip(moments[:50], sources, points, strict=False):
+        n = rng.normal(size=3)
+        h = 1e-5 * np.linalg.norm(b - a)
+        numeric = np.stack(
+            [(gradient(m, a, b + h * e).T @ n - gradient(m, a, b - h * e).T @ n) / (2 * h) for e in np.eye(3)], axis=-1
+        )
+        xx, xy, xz, yy, yz, zz = dipole_force_gradient(*m, *n, *(b - a))
+        exact = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        size = np.linalg.norm(exact)
+        np.testing.assert_allclose(exact / size, numeric / size, atol=1e-8)
+        assert abs(np.trace(exact)) < 1e-13 * size
+
+
+def test_gradient_of_the_papers_r_has_the_opposite_sign() -> None:
+    """The paper's formula with its r = source - point is -1 times the derivative of B."""
+    rng = np.random.default_rng(1)
+    m, a, b = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
+    r = a - b
+    u = r / np.linalg.norm(r)
+    papers = (
+        3
+        * MU_0
+        / (4 * np.pi * np.linalg.norm(r) ** 4)
+        * (np.outer(m, u) + np.outer(u, m) + (u @ m) * (np.eye(3) - 5 * np.outer(u, u)))
+    )
+    np.testing.assert_allclose(gradient(m, a, b), -papers, rtol=1e-12)
+
+
+def test_laws_are_linear_and_scale_with_distance(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    b, g = field(moments, sources, points), gradient(moments, sources, points)
+    np.testing.assert_allclose(field(3 * moments, sources, points), 3 * b, rtol=1e-13)
+    farther = sources + 2 * (points - sources)
+    np.testing.assert_allclose(field(moments, sources, farther), b / 8, rtol=1e-10, atol=1e-18)
+    np.testing.assert_allclose(gradient(moments, sources, farther), g / 16, rtol=1e-9, atol=1e-16)
+    behind = 2 * sources - points
+    np.testing.assert_allclose(field(moments, sources, behind), b, rtol=1e-9, atol=1e-16)
+    np.testing.assert_allclose(gradient(moments, sources, behind), -g, rtol=1e-9, atol=1e-14)
+
+
+def test_laws_turn_with_the_scene(dipoles: tuple[Floats, Floats, Floats], rng: np.random.Generator) -> None:
+    moments, sources, points = dipoles
+    q = rotations(rng, len(points))
+
+    def turned(v: Floats) -> Floats:
+        return np.einsum("nij,nj->ni", q, v)
+
+    b = field(turned(moments), turned(sources), turned(points))
+    g = gradient(turned(moments), turned(sources), turned(points))
+    expected = gradient(moments, sources, points)
+    size = np.linalg.norm(expected, axis=(-2, -1))[:, None, None]
+    np.testing.assert_allclose(b, turned(field(moments, sources, points)), rtol=1e-9, atol=1e-12 * np.abs(b).max())
+    np.testing.assert_allclose(g / size, q @ expected @ np.swapaxes(q, -1, -2) / size, atol=1e-12)
+
+
+def test_arguments_broadcast() -> None:
+    m, a, b = np.ones((4, 1, 3)), np.zeros(3), np.full((5, 3), 0.3)
+    assert field(m, a, b).shape == (4, 5, 3)
+    assert gradient(m, a, b).shape == (4, 5, 3, 3)
+    assert field([1, 0, 0], [0, 0, 0], [1, 0, 0]).shape == (3,)
+    assert field(np.ones((0, 3)), a, [1, 0, 0]).shape == (0, 3)
+    np.testing.assert_array_equal(field(m, a, b)[2, 3], field([1, 1, 1], a, b[0]))
+
+
+def test_laws_are_nan_at_the_source() -> None:
+    assert np.isnan(field([0, 0, 1], [0.1, 0, 0], [0.1, 0, 0])).all()
+    assert np.isnan(gradient([0, 0, 1], [0.1, 0, 0], [0.1, 0, 0])).all()
+
+
+def directions(n: int) -> Floats:
+    angle = np.linspace(0.0, np.pi / 2, n)
+    return np.stack([np.sin(angle), np.zeros(n), np.cos(angle)], axis=-1)
+
+
+def cylinder_field(points: Floats) -> Floats:
+    """Field of the exact 100 mm x 100 mm magnet along z."""
+    magnet = System().reference_epm
+    cylinder = magpylib.magnet.Cylinder(
+        dimension=(magnet.diameter_m, magnet.length_m), polarization=(0, 0, magnet.remanence_t)
+    )
+    exact: Floats = cylinder.getB(points)
+    return exact
+
+
+@pytest.mark.parametrize("distance", [0.125, 0.15, 0.2, 0.5])
+def test_dipole_is_the_cylinder_within_3_percent_far_off(distance: float) -> None:
+    points = distance * directions(19)
+    exact = cylinder_field(points)
+    dipole = field([0, 0, System().reference_epm.moment_am2], [0, 0, 0], points)
+    off = np.linalg.norm(dipole - exact, axis=-1) / np.linalg.norm(exact, axis=-1)
+    assert off.max() < 0.03
+
+
+def test_dipole_is_not_the_cylinder_close_by() -> None:
+    point = np.array([0.0, 0.0, 0.075])
+    exact = cylinder_field(point)
+    dipole = field([0, 0, System().reference_epm.moment_am2], [0, 0, 0], point)
+    assert abs(dipole[2] / exact[2] - 1) > 0.15
+
+
+def test_moment_is_that_of_the_polarised_cylinder() -> None:
+    magnet = Magnet(diameter_m=5e-3, length_m=5e-3)
+    cylinder = magpylib.magnet.Cylinder(dimension=(5e-3, 5e-3), polarization=(0, 0, magnet.remanence_t))
+    far = np.array([0.1, 0.2, 2.0])
+    np.testing.assert_allclose(field([0, 0, magnet.moment_am2], [0, 0, 0], far), cylinder.getB(far), rtol=1e-5)

@@ -1,0 +1,299 @@
+"""Pictures: to scale, the same for the same state, without a display, and out of the way of whoever does not draw."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import magenv
+from magenv.episodes import Episodes, Settings
+from magenv.params import PLANTS, System
+from magenv.render import RENDER_FPS, ROBOT_COLOURS, Renderer, Scene, scene_of
+from magenv.trajectories import approach
+from magenv.world import LOSSES
+
+Picture = NDArray[np.uint8]
+
+PLANT = PLANTS["paper"]
+MOVE_M = 0.02
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pygame no display to open: only what asks for a window may need one."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
+
+
+def a_scene(n_epm: int = 2, time_s: float = 50.0) -> Scene:
+    trajectory = approach(0.06)
+    angle = 2 * np.pi * np.arange(n_epm) / n_epm
+    return Scene(
+        time_s=time_s,
+        duration_s=trajectory.duration_s,
+        robots=np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]]),
+        reference=trajectory.at(time_s),
+        path=np.stack([trajectory.at(t)[:, :2] for t in np.linspace(0.0, trajectory.duration_s, 51)]),
+        epm_positions=0.3 * np.stack([np.cos(angle), np.sin(angle), np.ones(n_epm)], axis=-1),
+        epm_directions=np.tile([1.0, 0.0, 0.0], (n_epm, 1)),
+    )
+
+
+def bare_scene() -> Scene:
+    """Return a scene in which nothing but its body and arrow has a robot's colour or hides them."""
+    reference = np.array([[0.08, 0.0, 0.0], [-0.08, 0.0, 0.0]])
+    return replace(a_scene(), path=np.zeros((2, 2, 2)), reference=reference)
+
+
+def drawn(scene: Scene) -> Picture:
+    picture = Renderer(System(n_epm=len(scene.epm_positions)), PLANT, window=False).draw(scene)
+    assert picture is not None
+    return picture
+
+
+def moved(scene: Scene, robot: int, dx: float, dy: float) -> Scene:
+    robots = scene.robots.copy()
+    robots[robot, :2] += dx, dy
+    return replace(scene, robots=robots)
+
+
+def new_pixels(before: Picture, after: Picture, robot: int) -> NDArray[np.int64]:
+    """Return row and column of the pixels that took a robot's colour in the workspace, the square at the left."""
+    side = len(before)
+    was, is_now = ((picture[:, :side] == ROBOT_COLOURS[robot]).all(axis=-1) for picture in (before, after))
+    return np.argwhere(is_now & ~was)
+
+
+def shift_px(robot: int, dx: float, dy: float) -> NDArray[np.float64]:
+    """Return by how much (right, down) a robot's colour moves in the picture when the robot moves."""
+    scene = bare_scene()
+    before, after = drawn(scene), drawn(moved(scene, robot, dx, dy))
+    there, here = new_pixels(before, after, robot), new_pixels(after, before, robot)
+    assert len(there) > 300
+    assert len(here) > 300
+    down, right = there.mean(axis=0) - here.mean(axis=0)
+    return np.array([right, down])
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_picture_is_an_rgb_array_with_a_square_at_its_left(n_epm: int) -> None:
+    picture = drawn(a_scene(n_epm))
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape[2] == 3
+    assert picture.shape[1] > picture.shape[0]
+    for colour in ROBOT_COLOURS:
+        assert (picture == colour).all(axis=-1).any()
+
+
+@pytest.mark.parametrize("robot", [0, 1])
+def test_a_robot_that_moves_moves_its_colour_alone(robot: int) -> None:
+    right = shift_px(robot, MOVE_M, 0.0)
+    outward = MOVE_M if robot else -MOVE_M
+    up = shift_px(robot, 0.0, outward)
+    assert right[0] > 30
+    assert abs(right[1]) < 1
+    assert abs(up[0]) < 1
+    assert up[1] == pytest.approx(-np.sign(outward) * right[0], abs=1)  # y is up, rows count down, one scale for both
+    scene = bare_scene()
+    other = 1 - robot
+    before, after = drawn(scene), drawn(moved(scene, robot, MOVE_M, 0.0))
+    assert len(new_pixels(before, after, other)) == 0
+
+
+def test_bodies_and_wall_are_to_scale() -> None:
+    scene = bare_scene()
+    scale = shift_px(0, MOVE_M, 0.0)[0] / MOVE_M
+    # Robot 1 pointing along x, far from where it was: the rows of its colour are its disc's, an arrow being narrower.
+    rows = new_pixels(drawn(scene), drawn(moved(scene, 0, -0.05, -0.02)), 0)[:, 0]
+    assert np.ptp(rows) + 1 == pytest.approx(scale * PLANT.body.diameter_m, abs=2)
+    picture = drawn(scene)
+    middle = len(picture) // 2
+    wall = picture[middle + 1, middle + round(scale * PLANT.workspace_radius_m) + 3].astype(int)
+    outside = picture[middle + 1, middle + round(scale * PLANT.workspace_radius_m) + 12].astype(int)
+    assert wall.max() < 150
+    assert outside.min() > 200
+
+
+def test_a_turned_robot_and_a_turned_reference_look_different() -> None:
+    scene = a_scene()
+    for name in ("robots", "reference"):
+        poses = getattr(scene, name).copy()
+        poses[0, 2] += 1.0
+        assert (drawn(replace(scene, **{name: poses})) != drawn(scene)).any()
+
+
+def test_every_number_of_an_epm_shows() -> None:
+    scene = a_scene()
+    pictures = [drawn(scene)]
+    for axis in range(3):
+        positions, directions = scene.epm_positions.copy(), scene.epm_directions.copy()
+        positions[1, axis] -= 0.05
+        directions[1] = np.roll([0.6, 0.8, 0.0], axis)
+        pictures += [drawn(replace(scene, epm_positions=positions)), drawn(replace(scene, epm_directions=directions))]
+    assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+
+
+def test_each_loss_is_told_in_words_of_its_own() -> None:
+    scene = a_scene()
+    pictures = {drawn(replace(scene, loss=code)).tobytes() for code in range(len(LOSSES))}
+    assert len(pictures) == len(LOSSES)
+
+
+def test_same_scenes_give_the_same_pictures_and_no_picture_is_overwritten() -> None:
+    renderer = Renderer(System(), PLANT, window=False)
+    scene = a_scene()
+    first = renderer.draw(scene)
+    assert first is not None
+    kept = first.copy()
+    renderer.draw(moved(replace(scene, time_s=50.5), 0, MOVE_M, 0.0))
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(drawn(scene), kept)
+
+
+def test_trails_grow_and_restart_forgets_them() -> None:
+    renderer = Renderer(System(), PLANT, window=False)
+    scene = a_scene()
+    later = moved(replace(scene, time_s=50.5), 0, -MOVE_M, 0.0)
+    renderer.draw(scene)
+    trailing = renderer.draw(later)
+    renderer.restart()
+    assert trailing is not None
+    assert (trailing != drawn(later)).any()
+    np.testing.assert_array_equal(renderer.draw(later), drawn(later))
+
+
+def test_another_path_replaces_the_first() -> None:
+    renderer = Renderer(System(), PLANT, window=False)
+    scene = a_scene()
+    other = replace(scene, path=scene.path * [1.0, 0.5])
+    renderer.draw(other)
+    renderer.restart()
+    np.testing.assert_array_equal(renderer.draw(scene), drawn(scene))
+    assert (drawn(other) != drawn(scene)).any()
+
+
+def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
+    episodes = Episodes(1, Settings("approach-30"))
+    episodes.start(0, np.random.default_rng(0))
+    world, active = episodes.world, np.ones(1, np.bool_)
+    kept = 0
+    scene = scene_of(world, 0)
+    while not scene.loss:
+        terminated = episodes.step(np.zeros((1, episodes.actions.size)), active)[1]
+        scene = scene_of(world, 0)
+        assert scene.position_error_m == pytest.approx(world.measurements.position_error_end_m[0], rel=1e-9)
+        assert scene.heading_error_rad == pytest.approx(world.measurements.heading_error_end_rad[0], rel=1e-9)
+        kept += not terminated[0]
+        assert bool(terminated[0]) == (scene.loss > 0)
+    assert kept > 0
+    assert scene.time_s <= world.time_s()[0]
+    apart = world.robots[0, 1, :2] - world.robots[0, 0, :2]
+    assert scene.separation_m == pytest.approx(float(np.hypot(*apart)))
+    episodes.start(0, np.random.default_rng(0))
+    assert scene_of(world, 0).loss == 0
+
+
+def test_a_scene_does_not_follow_the_world() -> None:
+    episodes = Episodes(2, Settings("approach-60"))
+    for row in range(2):
+        episodes.start(row, np.random.default_rng(row))
+    scene = scene_of(episodes.world, 1)
+    names = ("robots", "reference", "path", "epm_positions", "epm_directions")
+    before = {name: getattr(scene, name).copy() for name in names}
+    np.testing.assert_array_equal(scene.robots, episodes.world.robots[1, :, :3])
+    episodes.world.robots += 1.0
+    episodes.world.epms += 1.0
+    episodes.world.coefficients += 1.0
+    for name in names:
+        np.testing.assert_array_equal(getattr(scene, name), before[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("robots", np.zeros((2, 6))),
+        ("reference", np.zeros(3)),
+        ("path", np.zeros((5, 2, 3))),
+        ("epm_positions", np.zeros(3)),
+        ("epm_directions", np.zeros((3, 3))),
+        ("loss", len(LOSSES)),
+    ],
+)
+def test_a_malformed_scene_is_refused(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"Input {name} must be"):
+        replace(a_scene(), **{name: value})  # type: ignore[arg-type]
+
+
+def test_rgb_array_of_the_environment_needs_no_display() -> None:
+    import pygame
+
+    env = gymnasium.make(magenv.ENV_ID, scenario="approach-60", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(np.zeros(env.action_space.shape, np.float32))
+    second = env.render()
+    assert isinstance(first, np.ndarray)
+    assert isinstance(second, np.ndarray)
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+    assert not pygame.display.get_init()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), first)  # the trail is a new one
+    env.close()
+
+
+def test_window_shows_at_the_frame_rate_and_closes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    renderer = Renderer(System(), PLANT, window=True)
+    start = pygame.time.get_ticks()
+    for step in range(3):
+        assert renderer.draw(a_scene(time_s=50.0 + step)) is None
+    assert pygame.time.get_ticks() - start >= 2 * 1000 / RENDER_FPS - 20
+    shown = pygame.display.get_surface()
+    assert shown is not None
+    picture = pygame.surfarray.array3d(shown).transpose(1, 0, 2)
+    for colour in ROBOT_COLOURS:
+        assert (picture == colour).all(axis=-1).any()
+    renderer.close()
+    renderer.close()
+    assert not pygame.display.get_init()
+
+
+@pytest.mark.parametrize("by_user", [True, False])
+def test_a_window_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch, by_user: bool) -> None:
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gymnasium.make(magenv.ENV_ID, scenario="approach-60", render_mode="human")
+    env.reset(seed=0)
+    if by_user:
+        pygame.event.post(pygame.event.Event(pygame.QUIT))
+    else:
+        pygame.display.quit()
+    for _ in range(2):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    assert not pygame.display.get_init()
+    env.reset(seed=1)
+    env.close()
+    env.close()
+
+
+def test_importing_the_environment_imports_no_plotting_library() -> None:
+    code = (
+        "import sys, magenv.env, magenv.vector_env\n"
+        "print(sorted({'pygame', 'matplotlib', 'torch'} & set(sys.modules)))\n"
+        "from magenv.params import PLANTS, System\n"
+        "magenv.render.Renderer(System(), PLANTS['paper'], window=False)\n"
+        "print(sorted({'pygame', 'matplotlib', 'torch'} & set(sys.modules)))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=dict(os.environ))
+    assert run.stdout.splitlines() == ["[]", "['pygame']"]

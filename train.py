@@ -1,0 +1,36 @@
+"""Train an agent, then compare it with the paper's controller on the same episodes: ``python train.py --help``."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+
+import tyro
+
+from agents.catalogue import controller
+from agents.command import command_line, friendly
+from agents.comparison import compare
+from agents.configs import TrainConfig
+from agents.learned import Learned
+from agents.learning import train
+
+EPISODES = 20
+SCENARIOS = ("approach-60", "approach-30")
+
+
+def main() -> None:
+    """Train, evaluate, report."""
+    config = tyro.cli(TrainConfig, description=TrainConfig.__doc__)
+    folder, finished = train(config, command_line())
+    if not finished:
+        print(f"Stopped early; model: {folder}, to go on: python train.py --resume {config.out}")
+        raise KeyboardInterrupt
+    agent = Learned(folder)
+    s = agent.settings
+    floor = [controller(name, s.n_epm, s.control_hz) for name in ("baseline", "idle", "random")]
+    compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, config.out, command_line())
+
+
+if __name__ == "__main__":
+    friendly(main)
