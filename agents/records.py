@@ -124,7 +124,7 @@ def load(path: Path) -> list[Record]:
         If there is no such file, or it is not one of ``save``.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             return _records({name: file[name] for name in file.files})
     except (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(

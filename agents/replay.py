@@ -21,7 +21,7 @@ _FRAME_MS = 100
 _LAST_FRAME_MS = 2000
 _PANEL_PX = 400
 _TITLE_PX = 34
-_COLOURS = 160
+_COLOURS = 255
 _INK, _PAPER, _ALARM = "#222222", "#FFFFFF", "#A41424"
 
 
@@ -57,7 +57,7 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (width, height * len(samples)))
     for row, sample in enumerate(samples):
         sheet.paste(sample, (0, height * row))
-    return sheet.quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
+    return sheet.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
 
 
 class _Show:
@@ -89,7 +89,7 @@ class _Show:
         picture = self._renderer.draw(self._scene(at, lost))
         assert picture is not None  # there is no window
         side = picture.shape[0]  # the workspace is the square at the left
-        view = Image.fromarray(picture[:, :side]).resize((_PANEL_PX, _PANEL_PX), Image.Resampling.LANCZOS)
+        view = Image.fromarray(picture[:, :side]).resize((_PANEL_PX, _PANEL_PX), Image.Resampling.BOX)
         panel = Image.new("RGB", (_PANEL_PX, _TITLE_PX + _PANEL_PX), _PAPER)
         panel.paste(view, (0, _TITLE_PX))
         pen = ImageDraw.Draw(panel)

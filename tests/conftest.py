@@ -56,6 +56,14 @@ def stuck_plant(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.fixture
+def rotations(rng: np.random.Generator) -> Floats:
+    """Twenty rotations of space, matrices (20, 3, 3)."""
+    q, _ = np.linalg.qr(rng.normal(size=(20, 3, 3)))
+    q[..., 0] *= np.linalg.det(q)[:, None]
+    return np.asarray(q)
+
+
+@pytest.fixture
 def turn_about_z() -> Rotation:
     """Return the matrix that turns by an angle (rad) about the vertical."""
 

@@ -23,6 +23,8 @@ Picture = NDArray[np.uint8]
 
 PLANT = PLANTS["paper"]
 MOVE_M = 0.02
+FAR = np.array([0.0, 0.0, 1.0, 0.0, 0.0] * 2, np.float32)
+"""Action that sends the EPMs far away, so that the robots take a while to get lost."""
 
 
 @pytest.fixture(autouse=True)
@@ -186,7 +188,7 @@ def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
     kept = 0
     scene = scene_of(world, 0)
     while not scene.loss:
-        terminated = episodes.step(np.zeros((1, episodes.actions.size)), active)[1]
+        terminated = episodes.step(FAR[None], active)[1]
         scene = scene_of(world, 0)
         assert scene.position_error_m == pytest.approx(world.measurements.position_error_end_m[0], rel=1e-9)
         assert scene.heading_error_rad == pytest.approx(world.measurements.heading_error_end_rad[0], rel=1e-9)
@@ -237,7 +239,7 @@ def test_rgb_array_of_the_environment_needs_no_display() -> None:
     env = gymnasium.make(magenv.ENV_ID, scenario="approach-60", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
-    env.step(np.zeros(env.action_space.shape, np.float32))
+    env.step(FAR)
     second = env.render()
     assert isinstance(first, np.ndarray)
     assert isinstance(second, np.ndarray)
@@ -280,7 +282,7 @@ def test_a_window_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch, by_
     else:
         pygame.display.quit()
     for _ in range(2):
-        env.step(np.zeros(env.action_space.shape, np.float32))
+        env.step(FAR)
     assert not pygame.display.get_init()
     env.reset(seed=1)
     env.close()

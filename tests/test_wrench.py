@@ -8,7 +8,6 @@ import magpylib
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_dipole import rotations
 
 from magenv.dipole import field, gradient
 from magenv.params import System
@@ -133,8 +132,8 @@ def test_robots_push_each_other_alike(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(forces[0], -forces[1], atol=1e-9 * np.linalg.norm(forces[0]))
 
 
-def test_dipole_wrench_turns_with_the_scene(rng: np.random.Generator) -> None:
-    for q in rotations(rng, 20):
+def test_dipole_wrench_turns_with_the_scene(rng: np.random.Generator, rotations: Floats) -> None:
+    for q in rotations:
         s, m, r = rng.normal(size=(3, 3))
         w, turned = pair(s, m, r), pair(q @ s, q @ m, q @ r)
         np.testing.assert_allclose(turned[TORQUE], q @ w[TORQUE], atol=1e-13 * np.linalg.norm(w))
