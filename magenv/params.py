@@ -98,10 +98,10 @@ class Body:
     """Literature: 8.56 g (MagRobot, capsule of 0.126 A m^2); rounded up."""
     inertia_kgm2: float = 1e-6
     """About the vertical; a capsule of 10 g, 11 mm wide and 26 mm long, has 6e-7, and carries fluid with it."""
-    drag_linear_nspm: float = 0.36
-    """Viscous drag against translation, N s/m (calibrated within 0.15 to 0.4)."""
-    drag_rotational_nmsprad: float = 5.3e-5
-    """Viscous drag against rotation, N m s/rad (calibrated within 5e-5 to 2e-4)."""
+    drag_linear_nspm: float = 0.15
+    """Viscous drag against translation, N s/m (calibrated, within 0.15 to 0.4)."""
+    drag_rotational_nmsprad: float = 5e-5
+    """Viscous drag against rotation, N m s/rad (calibrated, within 5e-5 to 2e-4)."""
     diameter_m: float = 0.011
     """Literature: commercial capsules are 10 to 12 mm wide."""
 

@@ -7,7 +7,6 @@ Lengths are in m; x points right, y (from above) or z (from the side) up. pygame
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -130,7 +129,6 @@ class _Canvas:
     """A surface and the few marks made on it; positions in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # else pygame greets on standard output
         import pygame
 
         self._draw = pygame.draw
@@ -154,12 +152,14 @@ class _Canvas:
         """Fill a box (left, top, width, height)."""
         self.surface.fill(colour, box)
 
-    def line(self, points: ArrayLike, colour: Colour, width: int = 1) -> None:
-        """Draw a polyline (n, 2), smooth if it is one pixel wide."""
-        if width == 1:
-            self._draw.aalines(self.surface, colour, False, np.asarray(points))
-        else:
-            self._draw.lines(self.surface, colour, False, np.asarray(points), width)
+    def line(self, points: ArrayLike, colour: Colour, width: int) -> None:
+        """Draw a polyline (n, 2)."""
+        self._draw.lines(self.surface, colour, False, np.asarray(points), width)
+
+    def thread(self, ends: Floats, colour: Colour) -> None:
+        """Draw a smooth line, one pixel wide, between two points (2, 2)."""
+        # Not ``aalines``: of two points it reads a third, beyond its memory, and its ends vary from call to call.
+        self._draw.aaline(self.surface, colour, ends[0], ends[1])
 
     def arrow(self, start: Floats, end: Floats, colour: Colour, width: float) -> None:
         """Draw an arrow with a filled head; nothing where it would be shorter than its head."""
@@ -284,7 +284,7 @@ class Renderer:
         for robot, away in ((0, apart), (1, -apart)):
             position, reference = scene.robots[robot], scene.reference[robot]
             canvas.text(str(robot + 1), zoom.px(position[:2] + away), _DARK[robot], 26, "center")
-            canvas.line(zoom.px([position[:2], reference[:2]]), _DARK[robot])
+            canvas.thread(zoom.px([position[:2], reference[:2]]), _DARK[robot])
             self._draw_robot(zoom, position, robot)
         for robot in range(2):
             self._draw_reference(zoom, scene.reference[robot], robot)
@@ -333,7 +333,7 @@ class Renderer:
         """Draw the EPMs and robots from above and from the side, and the EPMs' numbers."""
         canvas, beside = self._canvas, self._beside
         for x, _, z in scene.epm_positions:
-            canvas.line(beside.px([[x, 0.0], [x, z]]), _GREY)
+            canvas.thread(beside.px([[x, 0.0], [x, z]]), _GREY)
         for view, vertical, toward in ((self._above, 1, np.array([0, 0, 1])), (beside, 2, np.array([0, -1, 0]))):
             for k in np.argsort(scene.epm_positions @ toward, kind="stable"):
                 centre, moment = scene.epm_positions[k], scene.epm_directions[k]
@@ -402,8 +402,8 @@ class Renderer:
         lines = int(self._wall / _GRID_M)
         for at in _GRID_M * np.arange(-lines, lines + 1):
             reach = math.sqrt(max(self._wall**2 - at**2, 0.0))
-            canvas.line(zoom.px([[at, -reach], [at, reach]]), _GRID)
-            canvas.line(zoom.px([[-reach, at], [reach, at]]), _GRID)
+            canvas.thread(zoom.px([[at, -reach], [at, reach]]), _GRID)
+            canvas.thread(zoom.px([[-reach, at], [reach, at]]), _GRID)
         canvas.text("workspace from above", (_SIDE_PX / 2, 24), _GREY, anchor="center")
         self._draw_scale(zoom, (_SIDE_PX - 20, _SIDE_PX - 16), _GRID_M)
         self._draw_axes((_SIDE_PX - 70, _SIDE_PX - 50), "xy")

@@ -112,7 +112,7 @@ def test_integrator_is_of_second_order(rng: np.random.Generator, plant: Plant) -
 
 
 def test_energy_never_grows_without_input(rng: np.random.Generator) -> None:
-    """With the EPMs held still drag can only take: at the plant's own substep, over 1 s, from many starts."""
+    """With the EPMs held still drag can only take: at the plant's own substep, from rest, from many starts."""
     plant = WIDE
     for robots in states(rng, 20):
         robots[:, 3:] = 0.0
