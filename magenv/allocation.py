@@ -31,6 +31,8 @@ STATUSES = ("converged", "stationary", "iteration_limit")
 
 _MARGIN = 1e-3
 """Starts are moved inside the constraints by this share of their size."""
+_PROGRESS, _STALLED = 1e-6, 4
+"""A start has come to rest when this many steps in a row lower the cost by less than this share."""
 _NORM_FLOOR = 1e-6
 """Scaled targets smaller than this count as this large: half a micronewton."""
 
@@ -176,7 +178,7 @@ def descend(
     _constraints(pose, r_min, r_max, gap, values)
     barrier = 0.1 * cost / m
     dual = barrier / values
-    damping = 1e-2
+    damping, stalled = 1e-2, 0
     for iteration in range(max_iterations):
         if 2.0 * cost <= tolerance * tolerance:
             return cost, 0, iteration
@@ -202,7 +204,7 @@ def descend(
             for k in range(m):
                 total -= dual[k] * gradients[k, i]
             stationarity = max(stationarity, abs(total))
-        if stationarity <= 1e-7 * cost and complementarity <= 1e-8 * cost:
+        if complementarity <= 1e-8 * cost and (stationarity <= 1e-7 * cost or stalled >= _STALLED):
             return cost, 1, iteration
         barrier = min(0.2 * complementarity, 0.1 * cost, 0.1 * cost * cost + 1e-12 * cost)
         merit = cost + barrier * _barrier(values)
@@ -263,6 +265,7 @@ def descend(
             central = barrier / trial_values[k]
             dual[k] = min(max(dual[k], 1e-3 * central), 1e3 * central + 1e-300)
         damping = max(0.2 * damping, 1e-12) if length > 0.9 else damping
+        stalled = stalled + 1 if trial_cost > (1.0 - _PROGRESS) * cost else 0
         for i in range(n):
             pose[i] = trial[i]
         wrench[:] = trial_wrench

@@ -82,6 +82,8 @@ class Scene:
     def heading_error_rad(self) -> float:
         """Angle to the reference, absolute, mean of the robots, in rad."""
         differences = (self.robots - self.reference)[:, 2]
+        if not np.isfinite(differences).all():
+            return math.nan
         return sum(abs(math.remainder(difference, 2 * math.pi)) for difference in differences) / 2
 
     @property
@@ -268,10 +270,19 @@ class Renderer:
 
     def _compose(self, scene: Scene) -> None:
         """Draw the whole picture."""
-        canvas, zoom = self._canvas, self._zoom
         if self._path is None or not np.array_equal(self._path, scene.path):
             self._draw_path(scene.path)
-        canvas.surface.blit(self._path_backdrop, (0, 0))
+        self._canvas.surface.blit(self._path_backdrop, (0, 0))
+        self._draw_strip(scene)
+        if np.isfinite(scene.robots).all():  # a state that has burst cannot be placed: the rest is drawn without it
+            self._draw_robots(scene)
+        for robot in range(2):
+            self._draw_reference(self._zoom, scene.reference[robot], robot)
+        self._draw_readings(scene)
+
+    def _draw_robots(self, scene: Scene) -> None:
+        """Draw the robots in all views, and in the workspace their numbers and trails."""
+        canvas, zoom = self._canvas, self._zoom
         if scene.time_s != self._trail_time_s:
             self._trail.append(scene.robots[:, :2].copy())
             self._trail_time_s = scene.time_s
@@ -286,10 +297,8 @@ class Renderer:
             canvas.text(str(robot + 1), zoom.px(position[:2] + away), _DARK[robot], 26, "center")
             canvas.thread(zoom.px([position[:2], reference[:2]]), _DARK[robot])
             self._draw_robot(zoom, position, robot)
-        for robot in range(2):
-            self._draw_reference(zoom, scene.reference[robot], robot)
-        self._draw_readings(scene)
-        self._draw_strip(scene)
+            for view, height in ((self._above, position[1]), (self._beside, 0.0)):
+                canvas.disc(view.px([position[0], height]), self._radius * view.scale, ROBOT_COLOURS[robot])
 
     def _draw_robot(self, view: _View, pose: Floats, robot: int) -> None:
         """Draw body, magnet and heading of a robot at ``pose`` (3,)."""
@@ -330,7 +339,7 @@ class Renderer:
             canvas.text(_LOSS_WORDS[LOSSES[scene.loss]], (middle, 44), _WHITE, anchor="center")
 
     def _draw_strip(self, scene: Scene) -> None:
-        """Draw the EPMs and robots from above and from the side, and the EPMs' numbers."""
+        """Draw the EPMs from above and from the side, and their numbers."""
         canvas, beside = self._canvas, self._beside
         for x, _, z in scene.epm_positions:
             canvas.thread(beside.px([[x, 0.0], [x, z]]), _GREY)
@@ -339,9 +348,6 @@ class Renderer:
                 centre, moment = scene.epm_positions[k], scene.epm_directions[k]
                 pale = view is self._above and centre[2] < 0
                 self._draw_epm(view, centre[[0, vertical]], moment[[0, vertical]], float(moment @ toward), pale)
-            for robot in range(2):
-                x, y, _ = scene.robots[robot]
-                canvas.disc(view.px([x, y if vertical == 1 else 0.0]), self._radius * view.scale, ROBOT_COLOURS[robot])
             for k, centre in enumerate(scene.epm_positions):
                 canvas.disc(view.px(centre[[0, vertical]]), 8, _INK)
                 canvas.text(chr(ord("A") + k), view.px(centre[[0, vertical]]), _WHITE, 18, "center")

@@ -23,6 +23,7 @@ from magenv.actions import (
     planar_target,
     pose_to_action,
 )
+from magenv.allocation import allocate
 from magenv.params import System
 from magenv.poses import from_cartesian, home_pose, pose_bounds, project, robots_frame, to_cartesian
 from magenv.wrench import planar_moments, robot_wrench
@@ -222,25 +223,29 @@ def test_planar_target_is_the_wrench_in_the_magnet_frames(rng: np.random.Generat
             np.testing.assert_allclose(part, [0, w[2], c * w[0] + s * w[1], c * w[1] - s * w[0], 0], atol=1e-15)
 
 
-def test_wrench_action_gives_the_wrench_it_asks_for(rng: np.random.Generator) -> None:
-    """A tenth of the scales is within reach of these robots for nearly all draws."""
+def test_wrench_action_gives_what_allocation_can_give(rng: np.random.Generator) -> None:
+    """Where ten random starts reach the wrench asked for, the action nearly always does, too."""
     system = System()
     actions = Actions("wrench", system)
     robots = measured(rng, 40)
-    action = rng.uniform(-0.1, 0.1, (40, 6))
+    action = rng.uniform(-0.3, 0.3, (40, 6))
     epms, projected = actions.to_epms(action, robots, actions.home(robots))
     assert_allowed(epms, system)
     assert not projected.any()
     positions = np.concatenate([robots[..., :2], np.zeros((40, 2, 1))], axis=-1)
+    moments = planar_moments(robots[..., 2], system.ipm_moment_am2)
     pose = from_cartesian(epms[..., :3], epms[..., 3:])
-    u = robot_wrench(positions, planar_moments(robots[..., 2], system.ipm_moment_am2), pose, system.epm_moment_am2)
-    met = 0
+    u = robot_wrench(positions, moments, pose, system.epm_moment_am2)
+    met = reached = 0
     for row in range(40):
         target = np.empty(10)
         wrench = action[row] * np.tile([WRENCH_FORCE_N, WRENCH_FORCE_N, WRENCH_TORQUE_NM], 2)
         planar_target(wrench, robots[row, 0, 2], robots[row, 1, 2], target)
-        met += np.abs(u[row] - target).max() < 1e-6
-    assert met >= 36
+        if allocate(target, positions[row], moments[row], system).status == "converged":
+            reached += 1
+            met += np.abs(u[row] - target).max() < 1e-6
+    assert reached > 20
+    assert met >= 0.9 * reached
 
 
 def test_wrench_action_has_no_memory_but_the_epms(rng: np.random.Generator) -> None:

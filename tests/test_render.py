@@ -249,6 +249,14 @@ def test_a_malformed_scene_is_refused(name: str) -> None:
         replace(a_scene(), **{name: wrong})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_burst_state_is_drawn_without_its_robots(value: float) -> None:
+    robots = a_scene().robots
+    robots[1] = value
+    picture = drawn(replace(bare_scene(), robots=robots, loss=1))
+    assert len(new_pixels(picture, drawn(bare_scene()), 0)) > 300
+
+
 def test_rgb_array_of_the_environment_needs_no_display() -> None:
     import pygame
 
@@ -257,7 +265,7 @@ def test_rgb_array_of_the_environment_needs_no_display() -> None:
     first = env.render()
     assert isinstance(first, np.ndarray)
     env.step(FAR)
-    assert (env.render() != first).any()
+    assert not np.array_equal(np.asarray(env.render()), first)
     assert not pygame.display.get_init()
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), first)  # the trail is a new one

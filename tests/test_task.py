@@ -149,7 +149,7 @@ def test_robots_frame_observation_does_not_change_when_the_scene_turns(n_epm: in
 @pytest.mark.parametrize("angle", [0.8, math.pi])
 def test_a_turned_episode_stays_turned_in_home_mode(angle: float) -> None:
     """The same actions in the turned scene: same rewards, same flags, same observations but for the frame's heading."""
-    straight, turned = (Episodes(6, Settings()) for _ in range(2))
+    straight, turned = (Episodes(6, Settings(control_hz=10.0)) for _ in range(2))
     for batch in (straight, turned):
         for row in range(6):
             batch.start(row, np.random.default_rng(row))

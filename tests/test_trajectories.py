@@ -100,7 +100,7 @@ def test_random_family_heads_along_its_paths_smoothly(family: Floats) -> None:
     assert np.abs(np.angle(np.exp(1j * (along - middle)))).max() < math.radians(3.0)
     assert np.abs(np.diff(family[..., 2], axis=1)).max() / (TIMES[1] - TIMES[0]) < 0.12  # rad/s
     speed = np.linalg.norm(step, axis=-1) / (TIMES[1] - TIMES[0])
-    assert 1e-4 < speed.min()
+    assert speed.min() > 1e-4
     assert speed.max() < 5e-3
 
 
@@ -114,7 +114,7 @@ def test_random_family_covers_directions_and_sides(family: Floats) -> None:
 
 
 def nearest_approach(paths: Floats) -> float:
-    """Greatest distance in m of ``paths`` (1001, 2, 2) from the nearest approach, turned, with robots named either way."""
+    """Greatest distance in m of ``paths`` (1001, 2, 2) from the nearest approach, turned, robots named either way."""
     points = (paths[::50, :, 0] + 1j * paths[::50, :, 1]).T.ravel()
     best = math.inf
     for separation in np.linspace(0.012, 0.100, 23):

@@ -124,7 +124,7 @@ def test_newtons_third_law(rng: np.random.Generator) -> None:
 
 
 def test_robots_push_each_other_alike(rng: np.random.Generator) -> None:
-    """Third law in U: the forces on the robots, turned back from their frames, cancel where EPMs are too weak to act."""
+    """Third law in U: the forces, turned back from the magnet frames, cancel where EPMs are too weak to act."""
     for _ in range(10):
         positions, moments, pose = scene(rng, 2)
         u = robot_wrench(positions, moments, pose, 1e-12)

@@ -1,0 +1,117 @@
+"""Who may import whom, and what an environment loads."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import magenv
+
+PACKAGE = Path(magenv.__file__).parent
+ORDER = [
+    "params",
+    "kernels",
+    "dipole",
+    "poses",
+    "wrench",
+    "allocation",
+    "crosstalk",
+    "trajectories",
+    "dynamics",
+    "world",
+    "actions",
+    "task",
+    "episodes",
+    "render",
+    "env",
+    "vector_env",
+]
+"""Each module imports only from those before it; ``kernels`` says how to compile and stands at the very beginning."""
+MODULES = sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__")
+
+
+def imports(path: Path) -> set[str]:
+    """Return the absolute names of all modules that a file imports, at any depth of its code."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} has a relative import"
+            assert node.module is not None
+            found.add(node.module)
+            if node.module == "magenv":
+                found |= {f"magenv.{alias.name}" for alias in node.names}
+    return found
+
+
+def test_every_module_has_a_room() -> None:
+    assert set(MODULES) <= set(ORDER)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_modules_import_only_from_above(module: str) -> None:
+    allowed = {f"magenv.{name}" for name in ORDER[: ORDER.index(module)]} | {"magenv"}
+    own = {name for name in imports(PACKAGE / f"{module}.py") if name.split(".")[0] == "magenv"}
+    assert own <= allowed
+
+
+@pytest.mark.parametrize("module", [*MODULES, "__init__"])
+def test_magenv_never_imports_agents_nor_what_learns_or_plots(module: str) -> None:
+    names = {name.split(".")[0] for name in imports(PACKAGE / f"{module}.py")}
+    forbidden = {"agents", "torch", "stable_baselines3", "matplotlib"}
+    if module != "crosstalk":
+        assert not names & forbidden
+    assert "pygame" not in names or module == "render"
+
+
+@pytest.mark.parametrize("action", ["home", "wrench"])
+def test_env_loads_neither_torch_nor_pictures(action: str) -> None:
+    """In a process of its own: make, reset and step the scalar and the batched environment."""
+    code = f"""
+import sys
+import gymnasium, numpy, magenv
+env = gymnasium.make("magenv/TwoRobots-v0", action="{action}", render_mode="rgb_array")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+env.close()
+batch = gymnasium.make_vec(
+    "magenv/TwoRobots-v0", num_envs=2, vectorization_mode="vector_entry_point", action="{action}")
+batch.reset(seed=0)
+batch.step(batch.action_space.sample())
+batch.close()
+print(sorted({{name.split(".")[0] for name in sys.modules}} & {{
+    "agents", "torch", "matplotlib", "pygame", "stable_baselines3", "pandas", "tensorboard", "magpylib"}}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]"
+    assert done.stderr == ""
+
+
+def test_importing_the_package_registers_the_env_alone() -> None:
+    code = "import sys, magenv; print(sorted(n for n in sys.modules if n.startswith('magenv.')))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("changed", ["dipole.py", "params.py", "kernels.py"])
+def test_compiled_kernels_are_renewed_when_what_they_hold_changes(tmp_path: Path, changed: str) -> None:
+    """Constants of other modules, mu0 of ``params`` among them, are frozen in machine code: no change may go unseen."""
+    shutil.copytree(PACKAGE, tmp_path / "magenv", ignore=shutil.ignore_patterns("__pycache__"))
+    folders = []
+    for text in ("", "\nCHANGED = 1\n"):
+        with (tmp_path / "magenv" / changed).open("a", encoding="utf-8") as file:
+            file.write(text)
+        spec = importlib.util.spec_from_file_location("copied_kernels", tmp_path / "magenv" / "kernels.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        folders.append(module._CACHE_DIR)
+    assert folders[0] != folders[1]
