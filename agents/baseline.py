@@ -54,9 +54,7 @@ class Baseline:
         self._warm_start = warm_start
         self._system = System(n_epm=n_epm)
         self._period_s = TaskParams(control_hz=control_hz).period_s
-        self._layout = Layout(
-            self._system, Plant().workspace_radius_m, self._period_s, self.observation, self.frame
-        )
+        self._layout = Layout(self._system, Plant().workspace_radius_m, self._period_s, self.observation, self.frame)
         self._rng = np.random.default_rng(0)
 
     def seed(self, seed: int) -> None:

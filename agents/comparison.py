@@ -39,7 +39,9 @@ def compare(
     """
     names = [controller.name for controller in controllers]
     require(len(controllers) > 0 and len(set(names)) == len(names), "controllers", "one or more, each once", names)
-    require(len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios)
+    require(
+        len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios
+    )
     for scenario in scenarios:
         check_scenario(scenario)
     choose(PLANTS, "plant", plant)

@@ -65,7 +65,12 @@ class Learned:
         self._statistics = statistics
         self._policy = _build(card, weights, episodes.observation_space, episodes.action_space)
         size = episodes.observation_space.shape
-        require(statistics.mean.shape == statistics.variance.shape == size, "model", f"statistics of shape {size}", statistics.mean.shape)
+        require(
+            statistics.mean.shape == statistics.variance.shape == size,
+            "model",
+            f"statistics of shape {size}",
+            statistics.mean.shape,
+        )
 
     def seed(self, seed: int) -> None:
         """Do nothing: the policy's mode has no randomness."""
@@ -74,7 +79,12 @@ class Learned:
         """Raise ``ValueError`` unless the policy was made for this number of EPMs and control rate."""
         trained = self.settings
         require(trained.n_epm == n_epm, f"n_epm for {self.name}", f"{trained.n_epm}, as trained", n_epm)
-        require(trained.control_hz == control_hz, f"control_hz for {self.name}", f"{trained.control_hz}, as trained", control_hz)
+        require(
+            trained.control_hz == control_hz,
+            f"control_hz for {self.name}",
+            f"{trained.control_hz}, as trained",
+            control_hz,
+        )
 
     def predict(
         self,

@@ -108,8 +108,7 @@ def save_model(
     """Write the agent as it is now (see ``agents.store``), with its optimisers where asked."""
     own = config.ppo if config.algo == "ppo" else config.sac
     card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config)
-    statistics = env.obs_rms
-    assert not isinstance(statistics, dict)
+    statistics: Any = env.obs_rms
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
@@ -132,8 +131,7 @@ def restore(folder: Path, model: BaseAlgorithm, env: VecNormalize, algo: str) ->
     if isinstance(model, SAC):
         assert model.log_ent_coef is not None
         model.log_ent_coef.data.copy_(flat["log_ent_coef"])
-    statistics = env.obs_rms
-    assert not isinstance(statistics, dict)
+    statistics: Any = env.obs_rms
     statistics.mean, statistics.var = normalisation.mean, normalisation.variance
     statistics.count = normalisation.count
     model.num_timesteps = load_card(folder).steps
@@ -169,7 +167,9 @@ def resumed(config: TrainConfig) -> tuple[TrainConfig, Path]:
         raw |= {"out": config.out, "resume": config.resume, "steps": config.steps or raw["steps"]}
         old = TrainConfig(**raw)
     except (KeyError, TypeError) as error:
-        raise ValueError(f"Input resume must be a run of this version; instead received {found[-1]} ({error}).") from error
+        raise ValueError(
+            f"Input resume must be a run of this version; instead received {found[-1]} ({error})."
+        ) from error
     require(old.total_steps > card.steps, "steps", f"more than the {card.steps} already trained", old.total_steps)
     return old, found[-1]
 
@@ -204,7 +204,10 @@ class _Progress(BaseCallback):
         self._episodes.extend(info for info in self.locals["infos"] if "is_success" in info)
         told = ""
         if self._episodes:
-            means = {key: float(np.mean([e[key] for e in self._episodes])) for key in ("is_success", "position_error_m", "heading_error_rad")}
+            means = {
+                key: float(np.mean([e[key] for e in self._episodes]))
+                for key in ("is_success", "position_error_m", "heading_error_rad")
+            }
             position, heading = 1e3 * means["position_error_m"], math.degrees(means["heading_error_rad"])
             told = f"success {means['is_success']:.0%}  {position:.1f} mm  {heading:.1f} deg"
             self.logger.record("episodes/success_rate", means["is_success"])
@@ -260,7 +263,9 @@ def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
     finished = True
     try:
         remaining = config.total_steps - model.num_timesteps
-        model.learn(remaining, callback=progress, reset_num_timesteps=False, log_interval=1 if config.algo == "ppo" else 50)
+        model.learn(
+            remaining, callback=progress, reset_num_timesteps=False, log_interval=1 if config.algo == "ppo" else 50
+        )
     except KeyboardInterrupt:
         finished = False
     finally:
@@ -278,4 +283,3 @@ def _log_formats() -> list[str]:
     except ImportError:
         return ["csv"]
     return ["csv", "tensorboard"]
-

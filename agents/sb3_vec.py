@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -74,22 +74,20 @@ class TwoRobotsVecEnv(VecEnv):
         """Close the batched environment."""
         self._env.close()
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of the batched environment once per index."""
         return [getattr(self._env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Refuse: the episodes share one environment."""
         raise NotImplementedError("The episodes of a batched environment share their attributes.")
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: None | int | Iterable[int] = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
         """Refuse: the episodes share one environment."""
         raise NotImplementedError("The episodes of a batched environment have no methods of their own.")
 
-    def env_is_wrapped(
-        self, wrapper_class: type[Any], indices: None | int | Iterable[int] = None
-    ) -> Sequence[bool]:
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False per index: nothing is wrapped."""
         return [False] * len(list(self._get_indices(indices)))

@@ -51,7 +51,8 @@ class Card:
     @classmethod
     def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
         """Return the card of a model made now, with a dataclass as configuration."""
-        assert dataclasses.is_dataclass(config) and not isinstance(config, type)
+        assert dataclasses.is_dataclass(config)
+        assert not isinstance(config, type)
         plain = json.loads(json.dumps(dataclasses.asdict(config), default=str))
         return cls(algo, net, settings, steps, plain, {name: version(name) for name in _PACKAGES})
 

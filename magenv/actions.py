@@ -88,9 +88,7 @@ def _pose_rows(
 
 
 @kernel
-def _step_rows(
-    actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
-) -> None:
+def _step_rows(actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]) -> None:
     pose = np.empty(POSE_SIZE)
     for i in range(len(actions)):
         for k in range(targets.shape[1]):

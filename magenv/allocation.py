@@ -1,7 +1,7 @@
 """The inverse problem: EPM poses that give a desired wrench on both robots (paper, section II-C).
 
-Minimise ||S (U_d - U(x))||^2 over the pose vector x, with radii in [r_min, r_max] and every two EPM centres at least the
-gap apart; S divides forces and torques by their scales. Solved by a primal-dual interior-point method from several
+Minimise ||S (U_d - U(x))||^2 over the pose vector x, with radii in [r_min, r_max] and every two EPM centres at least
+the gap apart; S divides forces and torques by their scales. Solved by a primal-dual interior-point method from several
 starts; the best is kept.
 """
 
@@ -100,7 +100,10 @@ def _constraints(pose: Floats, r_min: float, r_max: float, gap: float, values: F
                 squared += (first[k] - second[k]) ** 2
             values[at] = (squared - gap * gap) / (2.0 * gap)
             at += 1
-    return values.min()
+    least = math.inf
+    for value in values:
+        least = min(least, value)
+    return least
 
 
 @kernel

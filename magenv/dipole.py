@@ -25,9 +25,7 @@ _K = MU_0 / (4 * math.pi)
 
 
 @kernel
-def dipole_field(
-    mx: float, my: float, mz: float, rx: float, ry: float, rz: float
-) -> tuple[float, float, float]:
+def dipole_field(mx: float, my: float, mz: float, rx: float, ry: float, rz: float) -> tuple[float, float, float]:
     """Return B (T) of the moment m (A m^2) at r = point - source (m): k (3 (m.r^) r^ - m) / |r|^3."""
     r2 = rx * rx + ry * ry + rz * rz
     inverse_r2 = 1.0 / r2

@@ -133,9 +133,7 @@ def resolve_contact(robots: Floats, mass: Floats, diameter: float, wall_radius: 
 
 
 @kernel
-def advance(
-    robots: Floats, epms: Floats, physics: Physics, row: int, h: float, factors: Floats, force: Floats
-) -> int:
+def advance(robots: Floats, epms: Floats, physics: Physics, row: int, h: float, factors: Floats, force: Floats) -> int:
     """Advance both robots (2, 6) by ``h`` in place; return the contact flags.
 
     ``factors`` are those of ``drag_factors`` for ``h``, ``force`` (2, 3) is scratch.
@@ -153,4 +151,3 @@ def advance(
             robots[robot, 3 + axis] = decay * robots[robot, 3 + axis] + gain * force[robot, axis]
             robots[robot, axis] += 0.5 * h * robots[robot, 3 + axis]
     return resolve_contact(robots, physics.mass[row], physics.body_diameter, physics.wall_radius)
-

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -32,10 +32,12 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     | ``action`` | meaning of -1 .. 1 |
     |---|---|
-    | ``home`` (default) | offset from the home configuration in the frame carried by the robots: angles -1.2 .. 1.2 rad; radius from r_min = 0.15 m over 0.2 m (0) to 0.35 m |
-    | ``pose`` | absolute pose, global frame: azimuths -pi .. pi, elevations -pi/2 .. pi/2, radius 0.15 .. 0.5 m |
-    | ``step`` | change of the present pose: angles -0.3 .. 0.3 rad, radius -50 .. 50 mm |
-    | ``wrench`` | ``Box(-1, 1, (6,))``: F_x, F_y (20 mN), tau_z (1 mN m) per robot, global frame, turned into poses by ``magenv.allocation`` |
+    | ``home`` (default) | offset from home in the robots' frame: angles +-1.2 rad; radius 0.15 .. 0.35 m |
+    | ``pose`` | absolute pose, global frame: azimuths +-pi, elevations +-pi/2, radius 0.15 .. 0.5 m |
+    | ``step`` | change of the present pose: angles +-0.3 rad, radius +-50 mm |
+    | ``wrench`` | ``Box(-1, 1, (6,))``: F_x, F_y (20 mN), tau_z (1 mN m) per robot, global frame |
+
+    Wrenches are turned into poses by ``magenv.allocation``.
 
     EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart;
     ``info["projected"]`` says so.
@@ -73,7 +75,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     * v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -109,9 +111,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         return self._episodes.observe()[0], _single(self._episodes.state_info())
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Command the EPMs for one control period.
 
         Raises
@@ -133,7 +133,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         return self._episodes.observe()[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: return an RGB array (h, w, 3), or show a window and return None."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array' given to gymnasium.make.")

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -40,10 +40,11 @@ def kernel(function: Function) -> Function:
     ``error_model="numpy"``: a division by zero gives infinity or NaN, as in numpy, instead of an exception. No fast
     mathematics: NaN and infinity stay visible, and scalar and batched calls give the same bits.
     """
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_DIR
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = _CACHE_DIR
     try:
-        compiled: Function = numba.njit(cache=True, error_model="numpy")(function)
-        return compiled
+        compiled: Any = numba.njit(cache=True, error_model="numpy")(function)
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
+    return cast("Function", compiled)

@@ -60,7 +60,7 @@ class System:
     r_min_m: float = 0.15
     """Least distance of an EPM's centre from the workspace centre (paper)."""
     r_max_m: float = 0.5
-    """Greatest distance of an EPM's centre from the workspace centre (not in the paper; reach of a collaborative arm)."""
+    """Greatest distance of an EPM's centre from the workspace centre (ours: reach of a collaborative arm)."""
     attraction_max_n: float = 98.1
     """Greatest mutual attraction of two EPMs, 10 kg of payload (paper)."""
 

@@ -128,7 +128,12 @@ def _observe(
     turn = frame if carried else 0.0
     c, s = math.cos(turn), math.sin(turn)
     for robot in range(2):
-        now, error, pose, rate = measured[robot], full[4 * robot :], full[_ROBOTS + 4 * robot :], full[_RATES + 3 * robot :]
+        now, error, pose, rate = (
+            measured[robot],
+            full[4 * robot :],
+            full[_ROBOTS + 4 * robot :],
+            full[_RATES + 3 * robot :],
+        )
         target = references[0, robot]
         x, y = _turn(target[0] - now[0], target[1] - now[1], c, s)
         error[0], error[1] = x / ERROR_SCALE_M, y / ERROR_SCALE_M
@@ -144,9 +149,7 @@ def _observe(
             x, y = _turn(ahead[0] - target[0], ahead[1] - target[1], c, s)
             preview[0], preview[1] = x / PREVIEW_SCALE_M, y / PREVIEW_SCALE_M
             preview[2] = wrap(ahead[2] - target[2])
-    full[_SEPARATION] = (
-        math.hypot(measured[1, 0] - measured[0, 0], measured[1, 1] - measured[0, 1]) / LENGTH_SCALE_M
-    )
+    full[_SEPARATION] = math.hypot(measured[1, 0] - measured[0, 0], measured[1, 1] - measured[0, 1]) / LENGTH_SCALE_M
     full[_FRAME], full[_FRAME + 1] = math.sin(frame), math.cos(frame)
     for k in range(len(epms)):
         epm, part = epms[k], full[_EPMS + _EPM_SIZE * k :]

@@ -55,7 +55,7 @@ class Trajectory:
         return cls(duration_s, np.ascontiguousarray(coefficients.transpose(2, 0, 3, 1)))
 
     def at(self, time_s: float) -> Floats:
-        """Return x, y (m) and heading (rad, not wrapped) of both robots (2, 3), held before the start and past the end."""
+        """Return x, y (m) and heading (rad, not wrapped) of both robots (2, 3), held still outside the duration."""
         out = np.empty((2, 3))
         reference_kernel(self.coefficients, self.duration_s, float(time_s), out)
         return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -70,12 +70,15 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         self._ended: Bools = np.ones(num_envs, np.bool_)
         self._renderers: list[Renderer] = []
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Begin episodes, in all rows or where ``options["reset_mask"]`` says; row i takes seed + i, or the i-th."""
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
-        seeds = [None] * self.num_envs if seeds is None else list(seeds)
+        seeds: list[int | None] = [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif seed is not None:
+            seeds = list(seed)
         require(len(seeds) == self.num_envs, "seed", f"a whole number or {self.num_envs} of them", seed)
         mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
@@ -101,7 +104,9 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         if any(rng is None for rng in self._rngs):
             raise RuntimeError("No episodes are running; call reset() before step().")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
-            raise RuntimeError(f"Episodes {np.flatnonzero(self._ended).tolist()} have ended; reset them with a reset_mask.")
+            raise RuntimeError(
+                f"Episodes {np.flatnonzero(self._ended).tolist()} have ended; reset them with a reset_mask."
+            )
         resetting = self._ended.copy()
         active = ~resetting
         reward, terminated, truncated = self._episodes.step(actions, active)
@@ -111,9 +116,8 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         info = _masked(self._episodes.step_info(), active)
         info |= _masked({"is_success": truncated.copy()}, ended)
         self._ended = ended
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            if ended.any():
-                info = self._same_step(info, ended)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
+            info = self._same_step(info, ended)
         info |= _masked(self._episodes.state_info(), np.ones(self.num_envs, np.bool_))
         return self._episodes.observe(), reward, terminated, truncated, info
 
@@ -127,20 +131,23 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         final = _masked({name: value.copy() for name, value in values.items()} | self._episodes.state_info(), ended)
         values.pop("is_success")
         self._start(ended)
-        return _masked(values, ~ended) | _masked({"final_obs": final_obs}, ended) | {"final_info": final, "_final_info": ended.copy()}
+        return (
+            _masked(values, ~ended)
+            | _masked({"final_obs": final_obs}, ended)
+            | {"final_info": final, "_final_info": ended.copy()}
+        )
 
     def _start(self, mask: Bools) -> None:
-        for row in np.flatnonzero(mask):
+        for row in np.flatnonzero(mask).tolist():
             rng = self._rngs[row]
             if rng is None:
                 rng = self._rngs[row] = seeding.np_random(None)[0]
-            self._episodes.start(int(row), rng)
+            self._episodes.start(row, rng)
+            if self._renderers:
+                self._renderers[row].restart()
         self._ended[mask] = False
-        for row, renderer in enumerate(self._renderers):
-            if mask[row]:
-                renderer.restart()
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one RGB array (h, w, 3) per episode."""
         if self.render_mode is None:
             return None

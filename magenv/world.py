@@ -45,14 +45,22 @@ class Measurements:
     @classmethod
     def empty(cls, n: int) -> Measurements:
         """Return the measurements of ``n`` episodes that have not begun."""
-        zeros = [np.zeros(n) for _ in range(4)]
-        return cls(*zeros, np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.int64))
+        return cls(
+            position_error_m=np.zeros(n),
+            heading_error_rad=np.zeros(n),
+            position_error_end_m=np.zeros(n),
+            heading_error_end_rad=np.zeros(n),
+            separation_min_m=np.full(n, np.nan),
+            separation_tracked_m=np.full(n, np.nan),
+            substeps=np.zeros(n, np.int64),
+            loss=np.zeros(n, np.int64),
+        )
 
 
 @kernel
 def wrap(angle: float) -> float:
     """Return ``angle`` in [-pi, pi]."""
-    return angle - 2.0 * math.pi * np.round(angle / (2.0 * math.pi))
+    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
 
 
 @kernel
@@ -90,9 +98,7 @@ def _hold(
         first = math.hypot(robots[0, 0] - reference[0, 0], robots[0, 1] - reference[0, 1])
         second = math.hypot(robots[1, 0] - reference[1, 0], robots[1, 1] - reference[1, 1])
         position_error = 0.5 * (first + second)
-        heading_error = 0.5 * (
-            abs(wrap(robots[0, 2] - reference[0, 2])) + abs(wrap(robots[1, 2] - reference[1, 2]))
-        )
+        heading_error = 0.5 * (abs(wrap(robots[0, 2] - reference[0, 2])) + abs(wrap(robots[1, 2] - reference[1, 2])))
         position_sum += position_error
         heading_sum += heading_error
         separation = math.hypot(robots[1, 0] - robots[0, 0], robots[1, 1] - robots[0, 1])
@@ -232,7 +238,7 @@ class World:
 
     def time_s(self) -> Floats:
         """Return the time of the current control instant (n,) in s."""
-        return self.step_count * self.period_s
+        return self.step_count.astype(np.float64) * self.period_s
 
     def references(self) -> Floats:
         """Return the references (n, 2, 3) at the current control instants: x, y (m), heading (rad)."""

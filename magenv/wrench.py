@@ -124,7 +124,13 @@ def _pose_tangents(pose: Floats, position: Floats, moment: Floats) -> None:
 def jacobian_kernel(positions: Floats, moments: Floats, pose: Floats, epm_moment: float, jacobian: Floats) -> None:
     """Write dU/dpose (10, 5 N); the mutual wrench of the robots does not depend on the pose."""
     frame, epm, r, source = np.empty((3, 3)), np.empty(6), np.empty(3), np.empty(3)
-    by_position, by_moment, tau, force, column = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(5)
+    by_position, by_moment, tau, force, column = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+        np.empty(5),
+    )
     for k in range(len(pose) // POSE_SIZE):
         block = pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE]
         pose_to_epm(block, epm)
@@ -177,7 +183,10 @@ def _rows(
     for name, value in (("positions", p), ("moments", m)):
         require(value.ndim >= 2 and value.shape[-2:] == (2, 3), name, "an array of shape (..., 2, 3)", value.shape)
     require(
-        x.ndim >= 1 and x.shape[-1] > 0 and x.shape[-1] % POSE_SIZE == 0, "pose", "an array of shape (..., 5 N)", x.shape
+        x.ndim >= 1 and x.shape[-1] > 0 and x.shape[-1] % POSE_SIZE == 0,
+        "pose",
+        "an array of shape (..., 5 N)",
+        x.shape,
     )
     require(math.isfinite(epm_moment_am2) and epm_moment_am2 > 0, "epm_moment_am2", "a positive number", epm_moment_am2)
     shape = np.broadcast_shapes(p.shape[:-2], m.shape[:-2], x.shape[:-1])

@@ -1,0 +1,541 @@
+"""Training: an agent learns, a run can be repeated, broken off and gone on with, and keeps what it has."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents.configs import PPOConfig, SACConfig, TrainConfig
+from agents.learned import Learned
+from agents.learning import build, checkpoints, restore, save_model, train
+from agents.rollout import run
+from agents.sb3_vec import TwoRobotsVecEnv
+from agents.store import CARD, POLICY, TRAINING, load_card, load_policy, load_training
+
+PPO_CONFIG = TrainConfig(
+    ppo=PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net=(16, 16)), steps=512, checkpoint_every=128
+)
+"""Four rollouts of 128 steps, a checkpoint after each."""
+SAC_CONFIG = TrainConfig(
+    algo="sac",
+    sac=SACConfig(n_envs=8, batch_size=32, buffer_size=2000, learning_starts=64, gradient_steps=2, net=(16, 16)),
+    steps=320,
+    checkpoint_every=160,
+)
+CONFIGS = {"ppo": PPO_CONFIG, "sac": SAC_CONFIG}
+both = pytest.mark.parametrize("algo", ["ppo", "sac"])
+
+MakeConfig = Callable[..., TrainConfig]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MakeConfig:
+    """Return a tiny training's configuration with changes, its run in the folder ``run``."""
+
+    def make(algo: str = "ppo", **changes: Any) -> TrainConfig:
+        return dataclasses.replace(CONFIGS[algo], **({"out": tmp_path / "run"} | changes))
+
+    return make
+
+
+def tensors_of(run_folder: Path) -> dict[str, torch.Tensor]:
+    """Return all tensors of a run's model."""
+    return load_file(run_folder / "model" / POLICY)
+
+
+def steps_of(run_folder: Path) -> list[int]:
+    """Return the step counts of a run's checkpoints."""
+    return [load_card(folder).steps for folder in checkpoints(run_folder)]
+
+
+def rows_of(run_folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's progress.csv."""
+    with (run_folder / "progress.csv").open(newline="") as file:
+        return list(csv.DictReader(file, strict=True))
+
+
+def total_steps(rows: list[dict[str, str]]) -> list[int]:
+    """Return the column of environment steps."""
+    return [int(row["time/total_timesteps"]) for row in rows]
+
+
+class Interrupter:
+    """Presses Ctrl-C in the ``at``-th step, or in the first reset (0), of the environments."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, at: int) -> None:
+        self._left, self._patch = at, patch
+        name = "step_wait" if at else "reset"
+        original = getattr(TwoRobotsVecEnv, name)
+
+        def interrupted(env: TwoRobotsVecEnv) -> Any:
+            self._left -= 1
+            if self._left <= 0:
+                raise KeyboardInterrupt
+            return original(env)
+
+        patch.setattr(TwoRobotsVecEnv, name, interrupted)
+
+
+# It learns.
+
+
+def test_an_agent_learns_a_tiny_task(tmp_path: Path) -> None:
+    """The time under control grows from a fifth of a second to 25 s and more, whichever the seed."""
+    settings = PPOConfig(n_envs=64, n_steps=32, batch_size=512, n_epochs=8, learning_rate=1e-3)
+    tiny = TrainConfig(
+        scenario="approach-100", control_hz=10.0, steps=40_960, seed=0, out=tmp_path / "run", ppo=settings
+    )
+    save_model(tmp_path / "untrained", *build(tiny), tiny, False, "")
+    folder, finished = train(tiny)
+    assert finished
+    held_s = {}
+    for name, path in (("untrained", tmp_path / "untrained"), ("trained", folder)):
+        records = run(Learned(path), "approach-100", control_hz=10.0, episodes=6, seed=100)
+        held_s[name] = np.array([record.time_s[-1] for record in records])
+    assert held_s["untrained"].max() < 1.0
+    assert held_s["trained"].min() > 10.0
+    told = [float(row["rollout/ep_rew_mean"]) for row in rows_of(tiny.folder) if row["rollout/ep_rew_mean"]]
+    assert told[-1] > 3 * told[0]
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path: Path) -> None:
+    runs = []
+    for name, seed in (("one", 3), ("two", 3), ("three", 4)):
+        train(dataclasses.replace(PPO_CONFIG, steps=256, seed=seed, out=tmp_path / name))
+        runs.append(tensors_of(tmp_path / name))
+        torch.rand(3)  # whatever has happened in the process before
+        np.random.rand(3)  # noqa: NPY002
+    one, two, three = runs
+    assert one.keys() == two.keys()
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert not any(torch.equal(one[name], three[name]) for name in one if name.endswith("weight"))
+
+
+# What a run leaves.
+
+
+@both
+def test_a_run_leaves_model_checkpoints_and_progress(config: MakeConfig, algo: str) -> None:
+    wanted = config(algo)
+    folder, finished = train(wanted, "python train.py --tiny")
+    assert finished
+    assert folder == wanted.folder / "model"
+    assert sorted(path.name for path in folder.iterdir()) == [CARD, POLICY]
+    card = load_card(folder)
+    assert (card.algo, card.steps, card.command) == (algo, wanted.total_steps, "python train.py --tiny")
+    assert steps_of(wanted.folder)[-1] == wanted.total_steps
+    assert len(checkpoints(wanted.folder)) == 2
+    rows = rows_of(wanted.folder)
+    assert total_steps(rows)[-1] == wanted.total_steps
+    assert float(rows[-1]["train/learning_rate"]) > 0.0
+    assert float(rows[-1]["episodes/success_rate"]) == 0.0
+    assert Learned(folder).predict(np.zeros(63, np.float32))[0].shape == (10,)
+
+
+def test_the_model_is_the_last_checkpoint(config: MakeConfig) -> None:
+    train(config())
+    last = load_file(checkpoints(config().folder)[-1] / POLICY)
+    model = tensors_of(config().folder)
+    assert last.keys() == model.keys()
+    assert all(torch.equal(last[name], model[name]) for name in model)
+
+
+def learning_rate(checkpoint: Path) -> float:
+    """Return the learning rate of the last gradient step before a PPO checkpoint."""
+    return load_training(checkpoint)["policy.optimizer.param_groups.0.lr"].item()
+
+
+def test_the_learning_rate_falls_to_a_tenth(config: MakeConfig) -> None:
+    train(config(steps=1280))
+    last = checkpoints(config().folder)[-1]
+    assert learning_rate(last) == pytest.approx(0.1 * PPO_CONFIG.ppo.learning_rate)
+
+
+# Going on.
+
+
+def live(algo: str) -> tuple[BaseAlgorithm, VecNormalize]:
+    """Return an agent after its first gradient steps."""
+    model, env = build(CONFIGS[algo])
+    model.learn(256)
+    return model, env
+
+
+def assert_equal_state(one: Any, other: Any) -> None:
+    """Compare nested dictionaries and lists of tensors and numbers, bit for bit."""
+    if isinstance(one, torch.Tensor):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_equal_state(one[key], other[key])
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        for a, b in zip(one, other, strict=True):
+            assert_equal_state(a, b)
+    else:
+        assert one == other
+
+
+@both
+def test_a_restored_agent_is_the_saved_one(algo: str, tmp_path: Path) -> None:
+    model, env = live(algo)
+    save_model(tmp_path / "saved", model, env, CONFIGS[algo], True, "")
+    again, its_env = build(dataclasses.replace(CONFIGS[algo], seed=99))
+    restore(tmp_path / "saved", again, its_env, algo)
+    assert again.num_timesteps == model.num_timesteps == 256
+    assert_equal_state(again.policy.state_dict(), model.policy.state_dict())
+    optimisers = ["policy.optimizer"] if algo == "ppo" else ["actor.optimizer", "critic.optimizer", "ent_coef_optimizer"]
+    for path in optimisers:
+        one, other = model, again
+        for name in path.split("."):
+            one, other = getattr(one, name), getattr(other, name)
+        state = one.state_dict()  # type: ignore[attr-defined]
+        assert state["state"][0]["step"] >= 2
+        assert state["state"][0]["exp_avg"].abs().max() > 0
+        assert_equal_state(other.state_dict(), state)  # type: ignore[attr-defined]
+    if algo == "sac":
+        assert torch.equal(again.log_ent_coef, model.log_ent_coef)  # type: ignore[attr-defined]
+        assert again.log_ent_coef.requires_grad  # type: ignore[attr-defined]
+    for name in ("mean", "var", "count"):
+        np.testing.assert_array_equal(getattr(its_env.obs_rms, name), getattr(env.obs_rms, name))
+
+
+def test_a_restored_agent_learns_from_the_same_data_what_the_saved_one_would(tmp_path: Path) -> None:
+    model, env = live("ppo")
+    save_model(tmp_path / "saved", model, env, PPO_CONFIG, True, "")
+    again, its_env = build(PPO_CONFIG)
+    restore(tmp_path / "saved", again, its_env, "ppo")
+    again.rollout_buffer = model.rollout_buffer  # type: ignore[attr-defined]
+    for agent in (model, again):
+        agent.set_logger(model.logger)
+        agent._current_progress_remaining = 0.4  # type: ignore[attr-defined]
+        np.random.seed(1)  # noqa: NPY002 (SB3 shuffles with it)
+        agent.train()  # type: ignore[attr-defined]
+    assert_equal_state(again.policy.state_dict(), model.policy.state_dict())
+
+
+@both
+def test_a_resumed_run_goes_on_where_it_stood(config: MakeConfig, algo: str) -> None:
+    first = config(algo)
+    train(first)
+    before, past = load_training(checkpoints(first.folder)[-1]), rows_of(first.folder)
+    _, finished = train(TrainConfig(resume=first.folder, steps=2 * first.total_steps))
+    assert finished
+    assert steps_of(first.folder)[-1] == load_card(first.folder / "model").steps == 2 * first.total_steps
+    after = load_training(checkpoints(first.folder)[-1])
+    (name,) = (key for key in before if key.endswith("optimizer.state.0.step") and key.startswith(("policy", "actor")))
+    done = before[name].item()
+    assert after[name].item() >= 2 * done - 40
+    if algo == "ppo":
+        assert after[name].item() == 2 * done
+    counted = [load_policy(folder)[1].count for folder in checkpoints(first.folder)]
+    assert counted[-1] == pytest.approx(2 * first.total_steps + 2 * 8, abs=1)  # a first observation per start
+    rows = rows_of(first.folder)
+    assert [{key: row[key] for key in old} for row, old in zip(rows, past, strict=False)] == past
+    assert total_steps(rows)[-1] == 2 * first.total_steps
+    assert len(rows) > len(past)
+    assert not list(Path().glob("runs/train/checkpoints/*")) or Path("runs/train") != first.folder
+
+
+def test_the_learning_rate_goes_on_falling_after_a_resume(config: MakeConfig) -> None:
+    """A run broken off and gone on with has the learning rates of one that was not."""
+    whole, broken = config(out=config().folder / "whole"), config(out=config().folder / "broken")
+    train(dataclasses.replace(whole, checkpoint_every=128))
+    expected = {path.name: learning_rate(path) for path in checkpoints(whole.folder)}
+    with pytest.MonkeyPatch.context() as patch:
+        Interrupter(patch, at=40)
+        train(broken)
+    assert steps_of(broken.folder)[-1] < 320
+    train(TrainConfig(resume=broken.folder))
+    last = checkpoints(broken.folder)[-1]
+    start = steps_of(broken.folder)[-1]
+    assert start >= 512
+    share = (512 - min(start, 512)) / 512
+    rate = PPO_CONFIG.ppo.learning_rate * (0.1 + 0.9 * share)
+    assert learning_rate(last) == pytest.approx(rate, rel=0.5)
+    assert learning_rate(last) <= min(expected.values()) * 1.001
+    rates = [float(row["train/learning_rate"]) for row in rows_of(broken.folder) if row["train/learning_rate"]]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] > 0.5 * PPO_CONFIG.ppo.learning_rate
+
+
+def test_a_resumed_run_does_not_meet_its_first_episodes_again(config: MakeConfig) -> None:
+    train(config(steps=128))
+    seen = []
+    original = TwoRobotsVecEnv.reset
+
+    def watched(env: TwoRobotsVecEnv) -> Any:
+        seen.append(original(env))
+        return seen[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TwoRobotsVecEnv, "reset", watched)
+        train(config(steps=128, out=config().folder.parent / "again"))
+        train(TrainConfig(resume=config().folder, steps=256))
+        train(TrainConfig(resume=config().folder, steps=384))
+    fresh, second, third = seen
+    assert not np.array_equal(second, fresh)
+    assert not np.array_equal(third, fresh)
+    assert not np.array_equal(third, second)
+
+
+def test_a_run_can_be_gone_on_with_elsewhere(config: MakeConfig, tmp_path: Path) -> None:
+    train(config())
+    before = {path.name: path.stat().st_mtime_ns for path in config().folder.rglob("*")}
+    train(TrainConfig(resume=config().folder, steps=640, out=tmp_path / "elsewhere"))
+    assert {path.name: path.stat().st_mtime_ns for path in config().folder.rglob("*")} == before
+    assert load_card(tmp_path / "elsewhere" / "model").steps == 640
+    assert total_steps(rows_of(tmp_path / "elsewhere"))[0] == 128
+
+
+def test_a_resumed_sac_fills_its_replay_buffer_before_it_learns(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stable_baselines3 import SAC
+
+    train(config("sac"))
+    sizes, original = [], SAC.train
+
+    def watched(model: SAC, gradient_steps: int, batch_size: int = 64) -> None:
+        assert model.replay_buffer is not None
+        if gradient_steps:
+            sizes.append(model.replay_buffer.size() * model.n_envs)
+        original(model, gradient_steps, batch_size)
+
+    monkeypatch.setattr(SAC, "train", watched)
+    train(TrainConfig(resume=config().folder, steps=640))
+    assert sizes[0] >= SAC_CONFIG.sac.learning_starts
+    assert len(sizes) > 20
+
+
+def test_runs_that_cannot_be_gone_on_with_are_refused(config: MakeConfig, tmp_path: Path) -> None:
+    def refused(**changes: Any) -> str:
+        with pytest.raises(ValueError, match=r"^Input .+ must .+; instead received .+") as raised:
+            train(TrainConfig(**({"resume": config().folder, "steps": 1024} | changes)))
+        assert "\n" not in str(raised.value)
+        return str(raised.value)
+
+    assert "resume" in refused(resume=tmp_path / "nowhere")
+    train(config())
+    assert "steps" in refused(steps=512)
+    kept = tmp_path / "kept"
+    shutil.copytree(config().folder, kept)
+
+    def doctored(file: str, change: Callable[[Path], object]) -> None:
+        shutil.rmtree(config().folder)
+        shutil.copytree(kept, config().folder)
+        change(checkpoints(config().folder)[-1] / file)
+        refused()
+
+    def card(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
+        def apply(path: Path) -> None:
+            raw = json.loads(path.read_text())
+            change(raw)
+            path.write_text(json.dumps(raw))
+
+        return apply
+
+    def tensors(change: Callable[[dict[str, torch.Tensor]], object]) -> Callable[[Path], object]:
+        def apply(path: Path) -> None:
+            raw = load_file(path)
+            change(raw)
+            save_file(raw, path)
+
+        return apply
+
+    doctored(CARD, card(lambda raw: raw["config"].pop("ppo")))
+    doctored(CARD, card(lambda raw: raw["config"].update(algo="dqn", steps=None)))
+    doctored(CARD, card(lambda raw: raw["config"].update(n_epm=3)))
+    doctored(CARD, card(lambda raw: raw["config"]["ppo"].update(net=[32, 32])))
+    doctored(CARD, card(lambda raw: raw["config"]["ppo"].update(n_envs="many")))
+    doctored(TRAINING, lambda path: path.unlink())
+    doctored(TRAINING, tensors(lambda raw: raw.pop("policy.optimizer.param_groups.0.lr")))
+    doctored(TRAINING, tensors(lambda raw: raw.update({"policy.optimizer.state.0.exp_avg": torch.zeros(3)})))
+    doctored(TRAINING, tensors(lambda raw: raw.update({"policy.optimizer.state.99.exp_avg": torch.zeros(3)})))
+    doctored(TRAINING, tensors(lambda raw: raw.update({"policy.optimizer.state.x.exp_avg": torch.zeros(3)})))
+
+
+# Breaking off.
+
+
+@both
+def test_ctrl_c_leaves_a_model_and_a_checkpoint_to_go_on_from(
+    config: MakeConfig, algo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = config(algo)
+    with monkeypatch.context() as patch:
+        Interrupter(patch, at=26)  # 25 steps of 8 environments are done
+        folder, finished = train(wanted, "python train.py")
+    assert not finished
+    assert load_card(folder).steps == steps_of(wanted.folder)[-1] == 200
+    assert Learned(folder).predict(np.zeros(63, np.float32))[0].shape == (10,)
+    assert total_steps(rows_of(wanted.folder))[-1] == 200
+    _, finished = train(TrainConfig(resume=wanted.folder))
+    assert finished
+    assert load_card(folder).steps >= wanted.total_steps
+    steps = total_steps(rows_of(wanted.folder))
+    assert 200 in steps
+    assert steps == sorted(steps)
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_ctrl_c_before_anything_is_learned_keeps_the_model_that_was_there(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    train(config())
+    before = {path: path.read_bytes() for path in (config().folder / "model").iterdir()}
+    Interrupter(monkeypatch, at)
+    with pytest.raises(KeyboardInterrupt):
+        train(config())
+    assert {path: path.read_bytes() for path in (config().folder / "model").iterdir()} == before
+    assert steps_of(config().folder)[-1] == 512
+
+
+def test_ctrl_c_right_after_a_resume_keeps_what_was_there(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(config())
+    with monkeypatch.context() as patch:
+        Interrupter(patch, at=0)
+        with pytest.raises(KeyboardInterrupt):
+            train(TrainConfig(resume=config().folder, steps=640))
+    assert steps_of(config().folder)[-1] == 512
+    train(TrainConfig(resume=config().folder, steps=640))
+    assert steps_of(config().folder)[-1] == 640
+
+
+def test_a_new_run_in_an_old_runs_folder_keeps_its_own_checkpoints(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(config(steps=1024))
+    with monkeypatch.context() as patch:
+        Interrupter(patch, at=41)
+        train(config(seed=1))
+    assert steps_of(config().folder) == [256, 320]
+    assert all(load_card(path).config["seed"] == 1 for path in checkpoints(config().folder))
+    train(TrainConfig(resume=config().folder))
+    assert load_card(config().folder / "model").config["seed"] == 1
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from safetensors.torch import save_file
+import agents.store
+from agents.configs import PPOConfig, TrainConfig
+from agents.learning import train
+
+files = 0
+
+def killing(tensors, path):
+    global files
+    files += 1
+    save_file(tensors, path)
+    if files == 4:  # the optimisers of the second checkpoint
+        os.truncate(path, 100)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+agents.store.save_file = killing
+ppo = PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net=(16, 16))
+train(TrainConfig(ppo=ppo, steps=512, checkpoint_every=128, out=Path(sys.argv[1])))
+"""
+
+
+def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_before(config: MakeConfig) -> None:
+    folder = config().folder
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(folder)],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    assert steps_of(folder) == [128]
+    Learned(checkpoints(folder)[-1])
+    _, finished = train(TrainConfig(resume=folder))
+    assert finished
+    assert load_card(folder / "model").steps == 512
+    assert total_steps(rows_of(folder))[0] == 128
+    assert all(path.name[5:].isdigit() for path in (folder / "checkpoints").iterdir()), "the half one is left over"
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scenario": "nowhere"},
+        {"plant": "moon"},
+        {"n_epm": 0},
+        {"n_epm": 4},
+        {"action": "jump"},
+        {"observation": "all"},
+        {"frame": "lab"},
+        {"control_hz": 0.0},
+        {"algo": "dqn"},
+    ],
+)
+def test_an_unsound_configuration_is_refused_before_anything_is_written(config: MakeConfig, changes: Any) -> None:
+    with pytest.raises(ValueError, match=r"^Input .+ must .+; instead received .+"):
+        train(config(**changes))
+    assert not config().folder.exists()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: TrainConfig(steps=0),
+        lambda: TrainConfig(seed=-1),
+        lambda: TrainConfig(checkpoint_every=0),
+        lambda: PPOConfig(n_envs=0),
+        lambda: PPOConfig(net=()),
+        lambda: PPOConfig(net=(64, 0)),
+        lambda: PPOConfig(learning_rate=float("nan")),
+        lambda: PPOConfig(gamma=1.5),
+        lambda: PPOConfig(gae_lambda=-0.1),
+        lambda: PPOConfig(log_std_init=float("inf")),
+        lambda: PPOConfig(n_envs=1, n_steps=1, batch_size=1),
+        lambda: SACConfig(gamma=-1.0),
+        lambda: SACConfig(buffer_size=0),
+        lambda: SACConfig(learning_starts=-1),
+    ],
+)
+def test_impossible_numbers_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match=r"^Input .+ must be .+; instead received .+"):
+        make()
+
+
+@pytest.mark.parametrize("kind", ["file", "foreign model"])
+def test_an_out_folder_that_cannot_be_used_is_refused_at_once(
+    config: MakeConfig, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.learning.build", lambda *_: pytest.fail("training was prepared"))
+    if kind == "file":
+        precious = tmp_path / "run"
+    else:
+        precious = tmp_path / "run" / "model" / "thesis.txt"
+        precious.parent.mkdir(parents=True)
+    precious.write_text("ten years")
+    with pytest.raises(ValueError, match=r"^Input out must be .+; instead received .+") as raised:
+        train(config())
+    assert "\n" not in str(raised.value)
+    assert precious.read_text() == "ten years"
