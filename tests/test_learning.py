@@ -44,6 +44,12 @@ both = pytest.mark.parametrize("algo", ["ppo", "sac"])
 MakeConfig = Callable[..., TrainConfig]
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in a folder of the test's own, so that default folders are not the project's."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def config(tmp_path: Path) -> MakeConfig:
     """Return a tiny training's configuration with changes, its run in the folder ``run``."""
@@ -110,7 +116,7 @@ def test_an_agent_learns_a_tiny_task(tmp_path: Path) -> None:
         held_s[name] = np.array([record.time_s[-1] for record in records])
     assert held_s["untrained"].max() < 1.0
     assert held_s["trained"].min() > 10.0
-    told = [float(row["rollout/ep_rew_mean"]) for row in rows_of(tiny.folder) if row["rollout/ep_rew_mean"]]
+    told = [float(row["rollout/ep_rew_mean"]) for row in rows_of(tiny.out) if row["rollout/ep_rew_mean"]]
     assert told[-1] > 3 * told[0]
 
 
@@ -135,13 +141,13 @@ def test_a_run_leaves_model_checkpoints_and_progress(config: MakeConfig, algo: s
     wanted = config(algo)
     folder, finished = train(wanted, "python train.py --tiny")
     assert finished
-    assert folder == wanted.folder / "model"
+    assert folder == wanted.out / "model"
     assert sorted(path.name for path in folder.iterdir()) == [CARD, POLICY]
     card = load_card(folder)
     assert (card.algo, card.steps, card.command) == (algo, wanted.total_steps, "python train.py --tiny")
-    assert steps_of(wanted.folder)[-1] == wanted.total_steps
-    assert len(checkpoints(wanted.folder)) == 2
-    rows = rows_of(wanted.folder)
+    assert steps_of(wanted.out)[-1] == wanted.total_steps
+    assert len(checkpoints(wanted.out)) == 2
+    rows = rows_of(wanted.out)
     assert total_steps(rows)[-1] == wanted.total_steps
     assert float(rows[-1]["train/learning_rate"]) > 0.0
     assert float(rows[-1]["episodes/success_rate"]) == 0.0
@@ -150,8 +156,8 @@ def test_a_run_leaves_model_checkpoints_and_progress(config: MakeConfig, algo: s
 
 def test_the_model_is_the_last_checkpoint(config: MakeConfig) -> None:
     train(config())
-    last = load_file(checkpoints(config().folder)[-1] / POLICY)
-    model = tensors_of(config().folder)
+    last = load_file(checkpoints(config().out)[-1] / POLICY)
+    model = tensors_of(config().out)
     assert last.keys() == model.keys()
     assert all(torch.equal(last[name], model[name]) for name in model)
 
@@ -163,7 +169,7 @@ def learning_rate(checkpoint: Path) -> float:
 
 def test_the_learning_rate_falls_to_a_tenth(config: MakeConfig) -> None:
     train(config(steps=1280))
-    last = checkpoints(config().folder)[-1]
+    last = checkpoints(config().out)[-1]
     assert learning_rate(last) == pytest.approx(0.1 * PPO_CONFIG.ppo.learning_rate)
 
 
@@ -236,43 +242,43 @@ def test_a_restored_agent_learns_from_the_same_data_what_the_saved_one_would(tmp
 def test_a_resumed_run_goes_on_where_it_stood(config: MakeConfig, algo: str) -> None:
     first = config(algo)
     train(first)
-    before, past = load_training(checkpoints(first.folder)[-1]), rows_of(first.folder)
-    _, finished = train(TrainConfig(resume=first.folder, steps=2 * first.total_steps))
+    before, past = load_training(checkpoints(first.out)[-1]), rows_of(first.out)
+    _, finished = train(TrainConfig(resume=first.out, steps=2 * first.total_steps))
     assert finished
-    assert steps_of(first.folder)[-1] == load_card(first.folder / "model").steps == 2 * first.total_steps
-    after = load_training(checkpoints(first.folder)[-1])
+    assert steps_of(first.out)[-1] == load_card(first.out / "model").steps == 2 * first.total_steps
+    after = load_training(checkpoints(first.out)[-1])
     (name,) = (key for key in before if key.endswith("optimizer.state.0.step") and key.startswith(("policy", "actor")))
     done = before[name].item()
     assert after[name].item() >= 2 * done - 40
     if algo == "ppo":
         assert after[name].item() == 2 * done
-    counted = [load_policy(folder)[1].count for folder in checkpoints(first.folder)]
+    counted = [load_policy(folder)[1].count for folder in checkpoints(first.out)]
     assert counted[-1] == pytest.approx(2 * first.total_steps + 2 * 8, abs=1)  # a first observation per start
-    rows = rows_of(first.folder)
+    rows = rows_of(first.out)
     assert [{key: row[key] for key in old} for row, old in zip(rows, past, strict=False)] == past
     assert total_steps(rows)[-1] == 2 * first.total_steps
     assert len(rows) > len(past)
-    assert not list(Path().glob("runs/train/checkpoints/*")) or Path("runs/train") != first.folder
+    assert not Path("runs").exists()
 
 
 def test_the_learning_rate_goes_on_falling_after_a_resume(config: MakeConfig) -> None:
     """A run broken off and gone on with has the learning rates of one that was not."""
-    whole, broken = config(out=config().folder / "whole"), config(out=config().folder / "broken")
+    whole, broken = config(out=config().out / "whole"), config(out=config().out / "broken")
     train(dataclasses.replace(whole, checkpoint_every=128))
-    expected = {path.name: learning_rate(path) for path in checkpoints(whole.folder)}
+    expected = {path.name: learning_rate(path) for path in checkpoints(whole.out)}
     with pytest.MonkeyPatch.context() as patch:
         Interrupter(patch, at=40)
         train(broken)
-    assert steps_of(broken.folder)[-1] < 320
-    train(TrainConfig(resume=broken.folder))
-    last = checkpoints(broken.folder)[-1]
-    start = steps_of(broken.folder)[-1]
+    assert steps_of(broken.out)[-1] < 320
+    train(TrainConfig(resume=broken.out))
+    last = checkpoints(broken.out)[-1]
+    start = steps_of(broken.out)[-1]
     assert start >= 512
     share = (512 - min(start, 512)) / 512
     rate = PPO_CONFIG.ppo.learning_rate * (0.1 + 0.9 * share)
     assert learning_rate(last) == pytest.approx(rate, rel=0.5)
     assert learning_rate(last) <= min(expected.values()) * 1.001
-    rates = [float(row["train/learning_rate"]) for row in rows_of(broken.folder) if row["train/learning_rate"]]
+    rates = [float(row["train/learning_rate"]) for row in rows_of(broken.out) if row["train/learning_rate"]]
     assert rates == sorted(rates, reverse=True)
     assert rates[0] > 0.5 * PPO_CONFIG.ppo.learning_rate
 
@@ -288,9 +294,9 @@ def test_a_resumed_run_does_not_meet_its_first_episodes_again(config: MakeConfig
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TwoRobotsVecEnv, "reset", watched)
-        train(config(steps=128, out=config().folder.parent / "again"))
-        train(TrainConfig(resume=config().folder, steps=256))
-        train(TrainConfig(resume=config().folder, steps=384))
+        train(config(steps=128, out=config().out.parent / "again"))
+        train(TrainConfig(resume=config().out, steps=256))
+        train(TrainConfig(resume=config().out, steps=384))
     fresh, second, third = seen
     assert not np.array_equal(second, fresh)
     assert not np.array_equal(third, fresh)
@@ -299,9 +305,9 @@ def test_a_resumed_run_does_not_meet_its_first_episodes_again(config: MakeConfig
 
 def test_a_run_can_be_gone_on_with_elsewhere(config: MakeConfig, tmp_path: Path) -> None:
     train(config())
-    before = {path.name: path.stat().st_mtime_ns for path in config().folder.rglob("*")}
-    train(TrainConfig(resume=config().folder, steps=640, out=tmp_path / "elsewhere"))
-    assert {path.name: path.stat().st_mtime_ns for path in config().folder.rglob("*")} == before
+    before = {path.name: path.stat().st_mtime_ns for path in config().out.rglob("*")}
+    train(TrainConfig(resume=config().out, steps=640, out=tmp_path / "elsewhere"))
+    assert {path.name: path.stat().st_mtime_ns for path in config().out.rglob("*")} == before
     assert load_card(tmp_path / "elsewhere" / "model").steps == 640
     assert total_steps(rows_of(tmp_path / "elsewhere"))[0] == 128
 
@@ -321,7 +327,7 @@ def test_a_resumed_sac_fills_its_replay_buffer_before_it_learns(
         original(model, gradient_steps, batch_size)
 
     monkeypatch.setattr(SAC, "train", watched)
-    train(TrainConfig(resume=config().folder, steps=640))
+    train(TrainConfig(resume=config().out, steps=640))
     assert sizes[0] >= SAC_CONFIG.sac.learning_starts
     assert len(sizes) > 20
 
@@ -329,7 +335,7 @@ def test_a_resumed_sac_fills_its_replay_buffer_before_it_learns(
 def test_runs_that_cannot_be_gone_on_with_are_refused(config: MakeConfig, tmp_path: Path) -> None:
     def refused(**changes: Any) -> str:
         with pytest.raises(ValueError, match=r"^Input .+ must .+; instead received .+") as raised:
-            train(TrainConfig(**({"resume": config().folder, "steps": 1024} | changes)))
+            train(TrainConfig(**({"resume": config().out, "steps": 1024} | changes)))
         assert "\n" not in str(raised.value)
         return str(raised.value)
 
@@ -337,12 +343,12 @@ def test_runs_that_cannot_be_gone_on_with_are_refused(config: MakeConfig, tmp_pa
     train(config())
     assert "steps" in refused(steps=512)
     kept = tmp_path / "kept"
-    shutil.copytree(config().folder, kept)
+    shutil.copytree(config().out, kept)
 
     def doctored(file: str, change: Callable[[Path], object]) -> None:
-        shutil.rmtree(config().folder)
-        shutil.copytree(kept, config().folder)
-        change(checkpoints(config().folder)[-1] / file)
+        shutil.rmtree(config().out)
+        shutil.copytree(kept, config().out)
+        change(checkpoints(config().out)[-1] / file)
         refused()
 
     def card(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
@@ -385,13 +391,13 @@ def test_ctrl_c_leaves_a_model_and_a_checkpoint_to_go_on_from(
         Interrupter(patch, at=26)  # 25 steps of 8 environments are done
         folder, finished = train(wanted, "python train.py")
     assert not finished
-    assert load_card(folder).steps == steps_of(wanted.folder)[-1] == 200
+    assert load_card(folder).steps == steps_of(wanted.out)[-1] == 200
     assert Learned(folder).predict(np.zeros(63, np.float32))[0].shape == (10,)
-    assert total_steps(rows_of(wanted.folder))[-1] == 200
-    _, finished = train(TrainConfig(resume=wanted.folder))
+    assert total_steps(rows_of(wanted.out))[-1] == 200
+    _, finished = train(TrainConfig(resume=wanted.out))
     assert finished
     assert load_card(folder).steps >= wanted.total_steps
-    steps = total_steps(rows_of(wanted.folder))
+    steps = total_steps(rows_of(wanted.out))
     assert 200 in steps
     assert steps == sorted(steps)
 
@@ -401,12 +407,12 @@ def test_ctrl_c_before_anything_is_learned_keeps_the_model_that_was_there(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
     train(config())
-    before = {path: path.read_bytes() for path in (config().folder / "model").iterdir()}
+    before = {path: path.read_bytes() for path in (config().out / "model").iterdir()}
     Interrupter(monkeypatch, at)
     with pytest.raises(KeyboardInterrupt):
         train(config())
-    assert {path: path.read_bytes() for path in (config().folder / "model").iterdir()} == before
-    assert steps_of(config().folder)[-1] == 512
+    assert {path: path.read_bytes() for path in (config().out / "model").iterdir()} == before
+    assert steps_of(config().out)[-1] == 512
 
 
 def test_ctrl_c_right_after_a_resume_keeps_what_was_there(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -414,10 +420,10 @@ def test_ctrl_c_right_after_a_resume_keeps_what_was_there(config: MakeConfig, mo
     with monkeypatch.context() as patch:
         Interrupter(patch, at=0)
         with pytest.raises(KeyboardInterrupt):
-            train(TrainConfig(resume=config().folder, steps=640))
-    assert steps_of(config().folder)[-1] == 512
-    train(TrainConfig(resume=config().folder, steps=640))
-    assert steps_of(config().folder)[-1] == 640
+            train(TrainConfig(resume=config().out, steps=640))
+    assert steps_of(config().out)[-1] == 512
+    train(TrainConfig(resume=config().out, steps=640))
+    assert steps_of(config().out)[-1] == 640
 
 
 def test_a_new_run_in_an_old_runs_folder_keeps_its_own_checkpoints(
@@ -427,10 +433,10 @@ def test_a_new_run_in_an_old_runs_folder_keeps_its_own_checkpoints(
     with monkeypatch.context() as patch:
         Interrupter(patch, at=41)
         train(config(seed=1))
-    assert steps_of(config().folder) == [256, 320]
-    assert all(load_card(path).config["seed"] == 1 for path in checkpoints(config().folder))
-    train(TrainConfig(resume=config().folder))
-    assert load_card(config().folder / "model").config["seed"] == 1
+    assert steps_of(config().out) == [256, 320]
+    assert all(load_card(path).config["seed"] == 1 for path in checkpoints(config().out))
+    train(TrainConfig(resume=config().out))
+    assert load_card(config().out / "model").config["seed"] == 1
 
 
 KILLED = """
@@ -458,7 +464,7 @@ train(TrainConfig(ppo=ppo, steps=512, checkpoint_every=128, out=Path(sys.argv[1]
 
 
 def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_before(config: MakeConfig) -> None:
-    folder = config().folder
+    folder = config().out
     killed = subprocess.run(
         [sys.executable, "-c", KILLED, str(folder)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -497,7 +503,7 @@ def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_before(c
 def test_an_unsound_configuration_is_refused_before_anything_is_written(config: MakeConfig, changes: Any) -> None:
     with pytest.raises(ValueError, match=r"^Input .+ must .+; instead received .+"):
         train(config(**changes))
-    assert not config().folder.exists()
+    assert not config().out.exists()
 
 
 @pytest.mark.parametrize(
