@@ -100,7 +100,7 @@ class Body:
     """About the vertical; a capsule of 10 g, 11 mm wide and 26 mm long, has 6e-7, and carries fluid with it."""
     drag_linear_nspm: float = 0.15
     """Viscous drag against translation, N s/m (calibrated, within 0.15 to 0.4)."""
-    drag_rotational_nmsprad: float = 6e-5
+    drag_rotational_nmsprad: float = 6.8e-5
     """Viscous drag against rotation, N m s/rad (calibrated, within 5e-5 to 2e-4)."""
     diameter_m: float = 0.011
     """Literature: commercial capsules are 10 to 12 mm wide."""

@@ -110,6 +110,16 @@ def test_pose_errors_come_first_scaled(make_env: MakeEnv) -> None:
         np.testing.assert_allclose([sine, cosine], [math.sin(error[robot, 2]), math.cos(error[robot, 2])], atol=1e-6)
 
 
+@pytest.mark.parametrize("turn", [3.0, -3.0, 2 * math.pi - 0.3, 0.3 - 2 * math.pi])
+def test_rate_is_the_shortest_turn(turn: float) -> None:
+    """A heading that passes the cut between pi and -pi from one measurement to the next is no fast turn."""
+    episodes = Episodes(1, Settings(frame="global"))
+    episodes.start(0, np.random.default_rng(0))
+    episodes._measured[0, 1, 2] = episodes._before[0, 1, 2] + turn
+    rate = unpack(episodes.observe()[0], episodes.layout).rates[1, 2]
+    assert rate == pytest.approx(math.remainder(turn, 2 * math.pi) / 0.5, rel=1e-6)
+
+
 def turned_scene(episodes: Episodes, angle: float) -> None:
     """Turn all that an episode holds about the vertical, in place."""
     c, s = math.cos(angle), math.sin(angle)
