@@ -31,8 +31,8 @@ STATUSES = ("converged", "stationary", "iteration_limit")
 
 _MARGIN = 1e-3
 """Starts are moved inside the constraints by this share of their size."""
-_PROGRESS, _STALLED = 1e-6, 4
-"""A start has come to rest when this many steps in a row lower the cost by less than this share."""
+_BARRIER_FALL, _BARRIER_END = 0.1, 1e-8
+"""Factor by which the barrier falls, and its share of the error at which a start is at rest."""
 _NORM_FLOOR = 1e-6
 """Scaled targets smaller than this count as this large: half a micronewton."""
 
@@ -181,7 +181,7 @@ def descend(
     _constraints(pose, r_min, r_max, gap, values)
     barrier = 0.1 * cost / m
     dual = barrier / values
-    damping, stalled = 1e-2, 0
+    damping, centred = 1e-2, False
     for iteration in range(max_iterations):
         if 2.0 * cost <= tolerance * tolerance:
             return cost, 0, iteration
@@ -199,17 +199,13 @@ def descend(
                 for k in range(m):
                     total += dual[k] / values[k] * gradients[k, i] * gradients[k, j]
                 gauss[i, j] = total
-        complementarity, stationarity = 0.0, 0.0
-        for k in range(m):
-            complementarity += dual[k] * values[k] / m
-        for i in range(n):
-            total = gradient[i]
-            for k in range(m):
-                total -= dual[k] * gradients[k, i]
-            stationarity = max(stationarity, abs(total))
-        if complementarity <= 1e-8 * cost and (stationarity <= 1e-7 * cost or stalled >= _STALLED):
-            return cost, 1, iteration
-        barrier = min(0.2 * complementarity, 0.1 * cost, 0.1 * cost * cost + 1e-12 * cost)
+        # Far from the central path the barrier must not fall: a centre that touches the curved gap constraint can
+        # hardly move along it. It falls once its own problem is about solved, and with the error itself.
+        if centred:
+            if barrier <= _BARRIER_END * cost:
+                return cost, 1, iteration
+            barrier *= _BARRIER_FALL
+        barrier = min(barrier, 0.1 * cost, 0.1 * cost * cost + _BARRIER_END * cost)
         merit = cost + barrier * _barrier(values)
         accepted = False
         for _ in range(12):
@@ -255,9 +251,13 @@ def descend(
             if accepted:
                 break
             damping = max(4.0 * damping, 1e-6)
-        if not accepted:
+        if not accepted:  # rounding: nothing lower is to be found with this barrier
+            if centred:
+                return cost, 1, iteration
+            centred = True
             _error(wrench, target, scale, error)
-            return cost, 1, iteration
+            continue
+        centred = slope <= m * barrier
         for k in range(m):
             change = 0.0
             for i in range(n):
@@ -268,7 +268,6 @@ def descend(
             central = barrier / trial_values[k]
             dual[k] = min(max(dual[k], 1e-3 * central), 1e3 * central + 1e-300)
         damping = max(0.2 * damping, 1e-12) if length > 0.9 else damping
-        stalled = stalled + 1 if trial_cost > (1.0 - _PROGRESS) * cost else 0
         for i in range(n):
             pose[i] = trial[i]
         wrench[:] = trial_wrench

@@ -1,0 +1,312 @@
+"""The two commands as a user meets them: what they write, how they end, what they say when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.configs import TrainConfig
+from agents.learned import Learned
+from agents.learning import checkpoints, train
+from agents.store import load_card
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "80"}
+TINY = [
+    *("--ppo.n-envs", "8", "--ppo.n-steps", "16", "--ppo.batch-size", "64", "--ppo.n-epochs", "1"),
+    *("--ppo.net", "16", "16"),
+]
+SHORT = """
+import sys
+sys.argv[0] = "train.py"
+import train
+from agents.command import friendly
+train.EPISODES, train.SCENARIOS = 1, ("approach-60",)
+friendly(train.main)
+"""
+"""train.py, its comparison cut short."""
+
+
+def command(script: str, *arguments: str) -> list[str]:
+    """Return the command line of a script, ``short`` being train.py with a short comparison; warnings are errors."""
+    code = ["-c", SHORT] if script == "short" else [str(ROOT / script)]
+    return [sys.executable, "-W", "error", *code, *arguments]
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a process that finds the scripts' modules."""
+    return ENVIRONMENT | {"PYTHONPATH": str(ROOT)}
+
+
+def call(folder: Path, script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a script in a folder."""
+    return subprocess.run(
+        command(script, *arguments),
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a script in a folder of the test's own; it is ended afterwards."""
+    processes = []
+
+    def begin(script: str, *arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            command(script, *arguments),
+            cwd=tmp_path,
+            env=environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        processes.append(process)
+        return process
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    """Wait until something is so, for a minute at most, while the process runs."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        if process.poll() is not None or time.monotonic() > deadline:
+            pytest.fail(f"exit code {process.poll()}: {process.communicate()[1] if process.poll() is not None else ''}")
+        time.sleep(0.02)
+
+
+def summary(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of a report's summary."""
+    rows: list[dict[str, Any]] = json.loads((folder / "summary.json").read_text())["rows"]
+    return rows
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Return all files below a folder."""
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# As a process.
+
+
+def test_evaluate_writes_the_report(tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    asked = ["--controllers", "idle", "baseline", "--scenarios", "approach-30-anti"]
+    done = call(tmp_path, "evaluate.py", *asked, "--episodes", "1", "--seed", "7", "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    rows = summary(out)
+    assert [(row["controller"], row["scenario"]) for row in rows] == [
+        ("idle", "approach-30-anti"),
+        ("baseline", "approach-30-anti"),
+    ]
+    for row in rows:
+        assert (row["plant"], row["n_epm"], row["control_hz"]) == ("paper", 2, 2.0)
+        assert (row["seed"], row["episodes"]) == (7, 1)
+    written = {path.name for path in out.iterdir()}
+    assert {
+        "report.md",
+        "episodes.csv",
+        "records",
+        "replay-approach-30-anti.gif",
+        "paths-approach-30-anti.png",
+    } <= written
+    assert "evaluate.py --controllers idle baseline" in (out / "report.md").read_text()
+    assert "baseline" in done.stdout
+    assert str(out / "report.md") in done.stdout.replace("\n", "")
+
+
+def test_evaluate_lists_its_controllers(tmp_path: Path) -> None:
+    done = call(tmp_path, "evaluate.py", "--list")
+    assert (done.returncode, done.stderr) == (0, "")
+    listed = done.stdout.splitlines()
+    assert listed[:4] == ["baseline", "tuned", "idle", "random"]
+    assert len(set(listed)) == len(listed)
+    assert not list(tmp_path.iterdir())
+
+
+def test_train_trains_compares_and_goes_on(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = call(tmp_path, "short", *TINY, "--steps", "256", "--checkpoint-every", "128", "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert load_card(out / "model").steps == 256
+    assert load_card(out / "model").command.startswith("python train.py --ppo.n-envs 8")
+    assert {row["controller"] for row in summary(out)} == {"ppo", "baseline", "idle", "random"}
+    assert (out / "progress.csv").read_text().count("\n") >= 3
+    assert "ppo" in done.stdout
+    assert "256/256" in done.stderr
+    before = (out / "progress.csv").read_text()
+    again = call(tmp_path, "short", "--resume", str(out), "--steps", "384")
+    assert again.returncode == 0, again.stderr
+    assert load_card(out / "model").steps == 384
+    assert len((out / "progress.csv").read_text()) > len(before)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"], "the run has gone on in another folder"
+
+
+def test_ctrl_c_in_train_leaves_a_model_and_a_checkpoint(
+    tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    out = tmp_path / "run"
+    process = start("train.py", *TINY, "--steps", "10000000", "--checkpoint-every", "256", "--out", str(out))
+    wait_for(lambda: bool(checkpoints(out)), process)
+    process.send_signal(signal.SIGINT)
+    told, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert f"--resume {out}" in told
+    assert Learned(out / "model").card.steps == load_card(checkpoints(out)[-1]).steps >= 256
+    rows = (out / "progress.csv").read_text().splitlines()
+    assert len(rows) >= 2
+    assert not (out / "summary.json").exists()
+    _, finished = train(TrainConfig(resume=out, steps=load_card(out / "model").steps + 128))
+    assert finished
+    assert (out / "progress.csv").read_text().count("\n") > len(rows)
+
+
+def test_ctrl_c_in_evaluate_leaves_a_report_of_what_was_done(
+    tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    controllers = ("idle", "baseline")
+    process = start("evaluate.py", "--controllers", *controllers, "--scenarios", "approach-60")
+    out = tmp_path / "runs" / "evaluate"
+    wait_for(out.exists, process)
+    time.sleep(2.0)  # idle loses all its episodes at once; then baseline takes its time
+    process.send_signal(signal.SIGINT)
+    told, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    done = {row["controller"]: row["episodes"] for row in summary(out)}
+    assert done["idle"] >= 1
+    assert sum(done.values()) < 40
+    assert (out / "report.md").is_file()
+    assert "idle" in told
+
+
+# Bad input: one line, exit code 2, nothing written.
+
+
+@pytest.mark.parametrize("arguments", [["--controllers", "idle", "--scenarios", "approach-5"], ["--episodes", "many"]])
+def test_bad_input_ends_the_process_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
+    done = call(tmp_path, "evaluate.py", *arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+BAD = {
+    "controller": ("evaluate.py", ["--controllers", "nobody"], "baseline.*'nobody'"),
+    "no controller": ("evaluate.py", ["--controllers"], "controllers"),
+    "controller twice": ("evaluate.py", ["--controllers", "idle", "idle"], "each once.*'idle', 'idle'"),
+    "scenario": ("evaluate.py", ["--controllers", "idle", "--scenarios", "approach-60", "line"], "approach.*'line'"),
+    "scenario twice": ("evaluate.py", ["--controllers", "idle", "--scenarios", "random", "random"], "each once"),
+    "plant": ("evaluate.py", ["--controllers", "idle", "--plant", "moon"], "paper.*'moon'"),
+    "episodes": ("evaluate.py", ["--controllers", "idle", "--episodes", "0"], "at least 1.*0"),
+    "seed": ("evaluate.py", ["--controllers", "idle", "--seed", "-1"], "at least 0.*-1"),
+    "n_epm 0": ("evaluate.py", ["--controllers", "idle", "--n-epm", "0"], "2 or 3.*0"),
+    "n_epm 0 of the baseline": ("evaluate.py", ["--controllers", "baseline", "--n-epm", "0"], "n_epm.*0"),
+    "n_epm 1": ("evaluate.py", ["--controllers", "idle", "--n-epm", "1"], "2 or 3.*1"),
+    "control_hz": ("evaluate.py", ["--controllers", "idle", "--control-hz", "0"], "positive.*0.0"),
+    "no model": ("evaluate.py", ["--controllers", "runs/nothing"], "model's folder.*'runs/nothing'"),
+    "option": ("evaluate.py", ["--controler", "idle"], "--controler"),
+    "number": ("evaluate.py", ["--n-epm", "two"], "n-epm.*'two'"),
+    "algorithm": ("train.py", ["--algo", "dqn"], "'dqn'.*ppo.*sac"),
+    "train scenario": ("train.py", ["--scenario", "line"], "approach.*'line'"),
+    "train plant": ("train.py", ["--plant", "moon"], "paper.*'moon'"),
+    "train n_epm": ("train.py", ["--n-epm", "0"], "2 or 3.*0"),
+    "train action": ("train.py", ["--action", "jump"], "'jump'.*home"),
+    "train steps": ("train.py", ["--steps", "0"], "positive.*0"),
+    "train net": ("train.py", ["--ppo.net", "0"], "widths.*0"),
+    "train resume": ("train.py", ["--resume", "runs/nothing"], "checkpoints.*'runs/nothing'"),
+}
+
+
+def refused(
+    script: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> str:
+    """Run a script in this process, which must end with exit code 2 and one line; return the line."""
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+    told = capfd.readouterr()
+    assert end.value.code == 2
+    assert told.out == ""
+    assert told.err.endswith("\n")
+    assert len(told.err.splitlines()) == 1, told.err
+    return told.err
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_told_in_one_line_and_nothing_is_written(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    script, arguments, pattern = BAD[case]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "evaluate").mkdir(parents=True)
+    (tmp_path / "runs" / "evaluate" / "summary.json").write_text("{}")
+    before = tree(tmp_path)
+    line = refused(script, arguments, monkeypatch, capfd)
+    assert re.search(pattern, line), line
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+@pytest.mark.parametrize("kind", ["a file", "below a file", "a file of /proc"])
+def test_an_out_folder_that_cannot_be_written_is_refused(
+    script: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("ten years")
+    out = {"a file": precious, "below a file": precious / "out", "a file of /proc": Path("/proc/self/out")}[kind]
+    arguments = ["--controllers", "idle", "--episodes", "1"] if script == "evaluate.py" else ["--steps", "64", *TINY]
+    line = refused(script, [*arguments, "--out", str(out)], monkeypatch, capfd)
+    assert "Input out must be" in line
+    assert str(out) in line
+    assert precious.read_text() == "ten years"
+
+
+@pytest.mark.parametrize("content", [b"\x80\x04K\x00.", b"{}", b"PK\x03\x04", b""])
+def test_a_foreign_model_is_refused(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "card.json").write_bytes(content)
+    before = tree(tmp_path)
+    line = refused(
+        "evaluate.py", ["--controllers", str(tmp_path / "model"), "--out", str(tmp_path / "out")], monkeypatch, capfd
+    )
+    assert "Input model must" in line
+    assert tree(tmp_path) == before
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_help_tells_every_option(
+    script: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+    told = capfd.readouterr()
+    assert end.value.code in (0, None)
+    assert told.err == ""
+    for option in ("--n-epm", "--plant", "--control-hz", "--seed", "--out"):
+        assert option in told.out
