@@ -32,21 +32,21 @@ class PPOConfig:
 
     n_envs: int = 128
     """Episodes side by side."""
-    n_steps: int = 64
+    n_steps: int = 32
     """Steps of each episode between updates."""
-    batch_size: int = 2048
+    batch_size: int = 1024
     """Samples of a gradient step."""
-    n_epochs: int = 5
+    n_epochs: int = 6
     """Passes over the samples of an update."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 6e-4
     """At the start; it falls linearly to a tenth."""
-    gamma: float = 0.97
-    """Discount per control step."""
-    gae_lambda: float = 0.95
+    gamma: float = 0.9
+    """Discount per control step: what a command does shows within few holds."""
+    gae_lambda: float = 0.9
     """Weight of long returns in the advantage."""
     log_std_init: float = -1.6
     """Logarithm of the policy's standard deviation at the start."""
-    net: tuple[int, ...] = (64, 64)
+    net: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of policy and value function."""
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class SACConfig:
     """Samples of a gradient step."""
     learning_rate: float = 7e-4
     """Of actor, critic and temperature; it falls linearly to a tenth."""
-    gamma: float = 0.97
+    gamma: float = 0.9
     """Discount per control step."""
     buffer_size: int = 300_000
     """Transitions kept."""
@@ -92,7 +92,7 @@ class SACConfig:
         )
 
 
-STEPS: dict[Algo, int] = {"ppo": 2_500_000, "sac": 200_000}
+STEPS: dict[Algo, int] = {"ppo": 3_000_000, "sac": 200_000}
 """Environment steps of a training where none are asked for."""
 
 
@@ -117,7 +117,7 @@ class TrainConfig:
     control_hz: float = 2.0
     """Control rate."""
     steps: int | None = None
-    """Environment steps; by default 2.5 million (ppo) or 200,000 (sac)."""
+    """Environment steps; by default 3 million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path = Path("runs/train")

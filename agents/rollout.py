@@ -17,9 +17,9 @@ from agents.controller import Controller
 from agents.records import Record
 from magenv import ENV_ID
 from magenv.episodes import Settings
-from magenv.params import PLANTS, System, TaskParams, require
+from magenv.params import TaskParams, require
 from magenv.trajectories import draw
-from magenv.world import LOSSES, World
+from magenv.world import LOSSES
 
 _CONTROLLER_STREAM = 1
 _MEASURED = (
@@ -106,8 +106,6 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
         states.append(info)
         holds.append(info)
     time_s = _stack(states, "time_s")
-    if terminated:
-        time_s[-1] = time_s[-2] + holds[-1]["substeps"] * _substep_s(settings)
     tracked = holds[-1]["separation_tracked_m"]
     return Record(
         controller=controller.name,
@@ -132,12 +130,6 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
 
 def _stack(infos: list[dict[str, Any]], name: str) -> NDArray[Any]:
     return np.array([info[name] for info in infos])
-
-
-def _substep_s(settings: Settings) -> float:
-    """Return the length of the plant's substeps at this control rate."""
-    task = TaskParams(control_hz=settings.control_hz)
-    return task.period_s / World(1, System(n_epm=settings.n_epm), PLANTS[settings.plant], task).substeps
 
 
 def _reference(settings: Settings, seed: int) -> NDArray[np.float64]:

@@ -144,7 +144,10 @@ def _wrench_rows(
         for j in range(WRENCH_SIZE):
             relative[j] = scale[j] / norm
         poses = starts.copy()
+        frame = robots_frame(measured[i, 0, 2], measured[i, 1, 2])
         for k in range(n_epm):
+            poses[1, POSE_SIZE * k] += frame
+            poses[1, POSE_SIZE * k + 3] += frame
             epm_to_pose(epms[i, k], poses[0, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
         best_of(
             target,

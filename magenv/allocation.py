@@ -8,6 +8,7 @@ starts; the best is kept.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -394,14 +395,19 @@ def allocate(
     u_d, p, m = (np.ascontiguousarray(value, dtype=np.float64) for value in (target, positions, moments))
     for name, value, shape in (("target", u_d, (WRENCH_SIZE,)), ("positions", p, (2, 3)), ("moments", m, (2, 3))):
         require(value.shape == shape, name, f"an array of shape {shape}", value.shape)
-        require(bool(np.isfinite(value).all()), name, "finite", value)
+        require(bool(np.isfinite(value).all()), name, "finite", value.tolist())
+    require(bool(np.any(p[0] != p[1])), "positions", "of two robots apart from each other", p.tolist())
+    require(bool(np.linalg.norm(m, axis=1).all()), "moments", "other than zero", m.tolist())
+    for name, number in (("force_scale_n", force_scale_n), ("torque_scale_nm", torque_scale_nm)):
+        require(math.isfinite(number) and number > 0, name, "a positive, finite number", number)
     size = POSE_SIZE * system.n_epm
     first = np.empty((0, size))
     if initial is not None:
         first = np.array(initial, dtype=np.float64)[None]
         require(first.shape == (1, size), "initial", f"an array of shape ({size},)", first.shape[1:])
-        require(bool(np.isfinite(first).all()), "initial", "finite", first[0])
-    require(starts >= 0 and starts + len(first) >= 1, "starts", "at least 1 (0 with an initial pose)", starts)
+        require(bool(np.isfinite(first).all()), "initial", "finite", first[0].tolist())
+    enough = isinstance(starts, int) and starts >= 0 and starts + len(first) >= 1
+    require(enough, "starts", "a whole number of at least 1 (0 with an initial pose)", starts)
     require(method in ("interior-point", "trust-constr"), "method", "interior-point or trust-constr", method)
     poses = np.concatenate([first, random_starts(system, starts, np.random.default_rng(seed))])
     scale = 1.0 / component_scales(force_scale_n, torque_scale_nm)
@@ -473,15 +479,20 @@ def _trust_constr(
     best, status, iterations, run = math.inf, 2, 0, 0
     for start in poses:
         make_interior(start, r_min, r_max, gap)
-        result = minimize(
-            cost,
-            start,
-            jac=gradient,
-            method="trust-constr",
-            bounds=Bounds(low, high, keep_feasible=True),
-            constraints=constraints,
-            options={"maxiter": max_iterations, "gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-12},
-        )
+        if run == 0:
+            best_pose[:] = start
+        with warnings.catch_warnings():
+            # SciPy warns where its quasi-Newton update sees no change; that ends the search, and is no fault
+            warnings.filterwarnings("ignore", message="delta_grad == 0.0", category=UserWarning)
+            result = minimize(
+                cost,
+                start,
+                jac=gradient,
+                method="trust-constr",
+                bounds=Bounds(low, high, keep_feasible=True),
+                constraints=constraints,
+                options={"maxiter": max_iterations, "gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-12},
+            )
         iterations += int(result.nit)
         run += 1
         if result.fun < best and (n == 1 or gaps(result.x).min() >= -1e-9):
@@ -490,7 +501,6 @@ def _trust_constr(
             best_pose[:] = result.x
         if stop_early and status == 0:
             break
-    if math.isfinite(best):
-        best = cost(best_pose)
-        best_wrench[:] = wrench
+    best = cost(best_pose)
+    best_wrench[:] = wrench
     return best, status, iterations, run

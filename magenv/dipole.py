@@ -1,7 +1,8 @@
 """The magnetic point dipole: field, gradient and second derivative.
 
 All laws use r = point - source. (The paper writes r = source - point: with that r its gradient formula has the wrong
-sign.) The dipole stands for a cylinder of equal length and diameter D within 3 % from 1.25 D of its centre.
+sign.) How well a dipole stands for a cylinder of equal length and diameter D: on the axis within 3 % from 1.25 D of its
+centre; broadside it is 11 % off there, 6 % at 1.5 D and 3 % at 2 D.
 
 References
 ----------

@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 
 TOUCH = 1
 WALL = 2
+_CONTACT_TURNS = 20
 
 
 class Physics(NamedTuple):
@@ -105,31 +106,45 @@ def drag_factors(physics: Physics, row: int, h: float, factors: Floats) -> None:
 def resolve_contact(robots: Floats, mass: Floats, diameter: float, wall_radius: float) -> int:
     """Part overlapping bodies, keep them inside the wall, stop approaching motion (inelastic); return TOUCH | WALL."""
     contact = 0
+    for _ in range(_CONTACT_TURNS):  # the wall may push a body back into the other
+        found = _part_bodies(robots, mass, diameter) | _keep_inside(robots, wall_radius - 0.5 * diameter)
+        contact |= found
+        if found == 0:
+            break
+    return contact
+
+
+@kernel
+def _part_bodies(robots: Floats, mass: Floats, diameter: float) -> int:
     dx, dy = robots[1, 0] - robots[0, 0], robots[1, 1] - robots[0, 1]
     distance = math.hypot(dx, dy)
-    if distance < diameter:
-        contact |= TOUCH
-        nx, ny = (dx / distance, dy / distance) if distance > 0.0 else (1.0, 0.0)
-        share = mass[1] / (mass[0] + mass[1])
-        approach = (robots[1, 3] - robots[0, 3]) * nx + (robots[1, 4] - robots[0, 4]) * ny
-        impulse = min(approach, 0.0)
-        for robot, part in ((0, share), (1, share - 1.0)):
-            robots[robot, 0] -= part * (diameter - distance) * nx
-            robots[robot, 1] -= part * (diameter - distance) * ny
-            robots[robot, 3] += part * impulse * nx
-            robots[robot, 4] += part * impulse * ny
-    limit = wall_radius - 0.5 * diameter
+    if not distance < diameter:
+        return 0
+    nx, ny = (dx / distance, dy / distance) if distance > 0.0 else (1.0, 0.0)
+    share = mass[1] / (mass[0] + mass[1])
+    impulse = min((robots[1, 3] - robots[0, 3]) * nx + (robots[1, 4] - robots[0, 4]) * ny, 0.0)
+    for robot, part in ((0, share), (1, share - 1.0)):
+        robots[robot, 0] -= part * (diameter - distance) * nx
+        robots[robot, 1] -= part * (diameter - distance) * ny
+        robots[robot, 3] += part * impulse * nx
+        robots[robot, 4] += part * impulse * ny
+    return TOUCH
+
+
+@kernel
+def _keep_inside(robots: Floats, limit: float) -> int:
+    found = 0
     for robot in range(2):
         x, y = robots[robot, 0], robots[robot, 1]
         radius = math.hypot(x, y)
         if radius > limit:
-            contact |= WALL
+            found = WALL
             nx, ny = x / radius, y / radius
             outward = max(robots[robot, 3] * nx + robots[robot, 4] * ny, 0.0)
             robots[robot, 0], robots[robot, 1] = limit * nx, limit * ny
             robots[robot, 3] -= outward * nx
             robots[robot, 4] -= outward * ny
-    return contact
+    return found
 
 
 @kernel

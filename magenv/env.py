@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
-from magenv.episodes import Episodes, Settings
+from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
 from magenv.render import RENDER_FPS, Renderer, scene_of
 from magenv.task import Frame, ObservationMode
@@ -123,7 +123,9 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if not self._running:
             raise RuntimeError("No episode is running; call reset() before step().")
-        reward, terminated, truncated = self._episodes.step(np.asarray(action)[None], _ACTIVE)
+        reward, terminated, truncated = self._episodes.step(
+            check_action(action, (self._episodes.actions.size,))[None], _ACTIVE
+        )
         info = _single(self._episodes.state_info() | self._episodes.step_info())
         ended = bool(terminated[0] or truncated[0])
         if ended:

@@ -37,6 +37,24 @@ class Settings:
     control_hz: float = 2.0
 
 
+def check_action(action: object, shape: tuple[int, ...]) -> Floats:
+    """Return an action, or a batch of them, as float64 clipped to [-1, 1].
+
+    Raises
+    ------
+    ValueError
+        If it has another shape or is not finite.
+    """
+    must_be = f"an array of shape {shape}"
+    try:
+        numbers = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"Input action must be {must_be}; instead received {action!r}.") from None
+    require(numbers.shape == shape, "action", must_be, numbers.shape)
+    require(bool(np.isfinite(numbers).all()), "action", "finite", numbers[~np.isfinite(numbers)].tolist())
+    return np.clip(numbers, -1.0, 1.0)
+
+
 class Episodes:
     """``n`` episodes side by side, each with a generator of its own.
 
@@ -103,17 +121,10 @@ class Episodes:
         )
         return out
 
-    def step(self, actions: NDArray[Any], active: Bools) -> tuple[Floats, Bools, Bools]:
-        """Act for one control period in the active rows; return reward, terminated, truncated (n,).
-
-        Raises
-        ------
-        ValueError
-            If the actions have the wrong shape or are not finite; nothing has moved then.
-        """
-        checked = self._check(actions)
+    def step(self, actions: Floats, active: Bools) -> tuple[Floats, Bools, Bools]:
+        """Act (n, size), checked, for one control period in the active rows; return reward, terminated, truncated."""
         w = self.world
-        targets, projected = self.actions.to_epms(checked, self._measured, w.epms)
+        targets, projected = self.actions.to_epms(actions, self._measured, w.epms)
         measured = w.step(targets, active)
         self._projected = np.where(active, projected, self._projected)
         self._before[active] = self._measured[active]
@@ -125,13 +136,6 @@ class Episodes:
         truncated = active & ~terminated & w.ended()
         reward = np.where(active, sum(self._terms.values()) / len(self._terms), 0.0)
         return reward, terminated, truncated
-
-    def _check(self, actions: NDArray[Any]) -> Floats:
-        checked = np.asarray(actions, dtype=np.float64)
-        shape = (len(self._measured), self.actions.size)
-        require(checked.shape == shape, "action", f"an array of shape {shape[1:]} per episode", checked.shape)
-        require(bool(np.isfinite(checked).all()), "action", "finite", checked)
-        return np.clip(checked, -1.0, 1.0)
 
     def state_info(self) -> dict[str, NDArray[Any]]:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""

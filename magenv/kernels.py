@@ -23,7 +23,7 @@ def _cache_dir() -> Path:
     digest = hashlib.sha256()
     for source in sorted(package.glob("*.py")):
         text = source.read_bytes()
-        if b"@kernel" in text:
+        if b"@kernel" in text or source.name == "params.py":  # params holds the constants
             digest.update(source.name.encode() + b"\0" + text)
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or package / "__pycache__")
     if not os.access(package, os.W_OK) and "NUMBA_CACHE_DIR" not in os.environ:

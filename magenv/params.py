@@ -73,6 +73,14 @@ class System:
         )
         _require_positive(r_min_m=self.r_min_m, r_max_m=self.r_max_m, attraction_max_n=self.attraction_max_n)
         require(self.r_max_m > self.r_min_m, "r_max_m", f"greater than r_min_m = {self.r_min_m}", self.r_max_m)
+        if self.n_epm > 1:  # two points of a sphere are at most 2 r apart, three sqrt(3) r
+            room = (2.0 if self.n_epm == 2 else math.sqrt(3.0)) * self.r_max_m
+            require(
+                self.gap_min_m <= room,
+                "attraction_max_n",
+                f"so large that the gap is at most {room:.3g} m",
+                self.attraction_max_n,
+            )
 
     @property
     def ipm_moment_am2(self) -> float:
@@ -136,6 +144,9 @@ PLANTS: dict[str, Plant] = {"paper": Plant()}
 """The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation."""
 
 
+CONTROL_HZ_RANGE = (0.1, 1000.0)
+
+
 @dataclass(frozen=True)
 class TaskParams:
     """Control rate, start and limits of an episode."""
@@ -152,8 +163,12 @@ class TaskParams:
     """A robot nearer than this to its reference counts as tracking (``separation_tracked``)."""
 
     def __post_init__(self) -> None:
+        fits = isinstance(self.control_hz, (int, float)) and not isinstance(self.control_hz, bool)
+        low, high = CONTROL_HZ_RANGE
+        require(
+            fits and low <= self.control_hz <= high, "control_hz", f"a number from {low} to {high}", self.control_hz
+        )
         _require_positive(
-            control_hz=self.control_hz,
             loss_distance_m=self.loss_distance_m,
             tracking_distance_m=self.tracking_distance_m,
         )

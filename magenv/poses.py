@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 POSE_SIZE = 5
 """Numbers per EPM in a pose vector."""
+_STUCK_TURNS = 100
 GAP_TOLERANCE_M = 1e-9
 """Within this the least gap and the radius limits hold after ``project``."""
 
@@ -57,9 +58,21 @@ def clip_radius(epm: Floats, r_min: float, r_max: float) -> None:
     radius = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
     if r_min <= radius <= r_max:
         return
+    if radius == 0.0:  # no radius to move along: any will do
+        epm[0] = r_min
+        return
     scale = min(max(radius, r_min), r_max) / radius
     for i in range(3):
         epm[i] *= scale
+
+
+@kernel
+def tangent(epm: Floats) -> tuple[float, float, float]:
+    """Return a horizontal unit vector at right angles to the radius of ``epm``."""
+    horizontal = math.hypot(epm[0], epm[1])
+    if horizontal < 1e-9:
+        return 1.0, 0.0, 0.0
+    return -epm[1] / horizontal, epm[0] / horizontal, 0.0
 
 
 @kernel
@@ -71,10 +84,8 @@ def separate(first: Floats, second: Floats, gap: float) -> float:
     if short <= 0.0:
         return 0.0
     if distance < 1e-9:  # no joining line: take a tangent of the sphere, the flattest way out
-        dx, dy, dz = -first[1], first[0], 0.0
-        if math.hypot(dx, dy) < 1e-9:
-            dx, dy = 1.0, 0.0
-        distance = math.hypot(dx, dy)
+        dx, dy, dz = tangent(first)
+        distance = 1.0
     push = 0.5 * short / distance
     first[0] -= push * dx
     first[1] -= push * dy
@@ -92,7 +103,7 @@ def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
     for i in range(n):
         clip_radius(epms[i], r_min, r_max)
     moved = False
-    for _ in range(10_000):
+    for turn in range(10_000):
         worst = 0.0
         for i in range(n):
             for j in range(i + 1, n):
@@ -100,6 +111,11 @@ def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
         if worst <= GAP_TOLERANCE_M:
             break
         moved = True
+        if turn % _STUCK_TURNS == _STUCK_TURNS - 1:  # on one ray there may be no room: leave it sideways
+            for i in range(n):
+                x, y, z = tangent(epms[i])
+                for axis, part in ((0, x), (1, y), (2, z)):
+                    epms[i, axis] += (i - 0.5 * (n - 1)) * 0.1 * gap * part
         for i in range(n):
             clip_radius(epms[i], r_min, r_max)
     return moved
@@ -189,8 +205,16 @@ def project(pose: ArrayLike, system: System) -> tuple[Floats, bool]:
 
     Centres that are too close are moved apart symmetrically along their joining line and their radii clipped, in
     turns, until both hold within 1e-9 m; moments are kept.
+
+    Raises
+    ------
+    ValueError
+        If the pose is not of the system's size or not finite.
     """
-    array = _as_rows(pose, POSE_SIZE, "pose", "an array of shape (5 N,)")
+    array = np.asarray(pose, dtype=np.float64)
+    size = POSE_SIZE * system.n_epm
+    require(array.shape == (size,), "pose", f"an array of shape ({size},)", array.shape)
+    require(bool(np.isfinite(array).all()), "pose", "finite", array.tolist())
     centres, moments = to_cartesian(array)
     epms = np.concatenate([centres, moments], axis=-1)
     moved = project_epms(epms, system.r_min_m, system.r_max_m, system.gap_min_m)

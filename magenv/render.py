@@ -95,11 +95,7 @@ class Scene:
 def scene_of(world: World, row: int) -> Scene:
     """Return a copy of what there is to see of one episode; where control is lost, at that very instant."""
     trajectory = Trajectory(float(world.duration_s[row]), world.coefficients[row])
-    steps = int(world.step_count[row])
-    time = steps * world.period_s
-    loss = int(world.measurements.loss[row]) if steps > 0 else 0  # before the first step it is the last episode's
-    if loss:
-        time = (steps - 1 + int(world.measurements.substeps[row]) / world.substeps) * world.period_s
+    time = float(world.time_s()[row])
     samples = np.linspace(0.0, trajectory.duration_s, PATH_SAMPLES)
     return Scene(
         time_s=time,
@@ -109,7 +105,7 @@ def scene_of(world: World, row: int) -> Scene:
         path=np.stack([trajectory.at(sample)[:, :2] for sample in samples]),
         epm_positions=world.epms[row, :, :3].copy(),
         epm_directions=world.epms[row, :, 3:].copy(),
-        loss=loss,
+        loss=int(world.measurements.loss[row]),
     )
 
 

@@ -159,7 +159,8 @@ def _observe(
         part[4], part[5] = _turn(epm[3], epm[4], c, s)
         part[6] = epm[5]
     for i in range(len(out)):
-        out[i] = min(max(np.float32(full[i]), -bounds[i]), bounds[i])
+        value = np.float32(full[i]) if math.isfinite(full[i]) else np.float32(0.0)
+        out[i] = min(max(value, -bounds[i]), bounds[i])
 
 
 @kernel
@@ -236,6 +237,8 @@ def unpack(observation: ArrayLike, layout: Layout) -> Parts:
 @kernel
 def _closeness(error: float, scales: tuple[float, float, float]) -> float:
     """Return one at zero error, falling through three scales to zero: near and far errors both have a slope."""
+    if not error < math.inf:  # NaN: the state was lost, nothing is paid
+        return 0.0
     total = 0.0
     for scale in scales:
         total += 1.0 / (1.0 + (error / scale) ** 2)

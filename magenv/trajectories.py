@@ -27,7 +27,7 @@ HALF_WIDTH_M = 0.050
 """Distance of each robot from the x axis at both ends of an approach scenario."""
 
 SCENARIO_HELP = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
-_APPROACH = re.compile(r"approach-(\d+(?:\.\d+)?)(-anti)?")
+_APPROACH = re.compile(r"approach-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)
 
 RANDOM_SEPARATION_M = (0.025, 0.100)
 """Range of the least separation in the random family."""

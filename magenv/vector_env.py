@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
-from magenv.episodes import Bools, Episodes, Settings
+from magenv.episodes import Bools, Episodes, Settings, check_action
 from magenv.params import require
 from magenv.render import RENDER_FPS, Renderer, scene_of
 from magenv.task import Frame, ObservationMode
@@ -77,9 +77,10 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         seeds: list[int | None] = [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif seed is not None:
+        elif isinstance(seed, (list, tuple)):
             seeds = list(seed)
-        require(len(seeds) == self.num_envs, "seed", f"a whole number or {self.num_envs} of them", seed)
+        fits = seed is None or isinstance(seed, (int, np.integer, list, tuple))
+        require(fits and len(seeds) == self.num_envs, "seed", f"a whole number or {self.num_envs} of them", seed)
         mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
@@ -107,15 +108,16 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
             raise RuntimeError(
                 f"Episodes {np.flatnonzero(self._ended).tolist()} have ended; reset them with a reset_mask."
             )
+        checked = check_action(actions, (self.num_envs, self._episodes.actions.size))
         resetting = self._ended.copy()
         active = ~resetting
-        reward, terminated, truncated = self._episodes.step(actions, active)
+        reward, terminated, truncated = self._episodes.step(checked, active)
         ended = terminated | truncated
         if resetting.any():
             self._start(resetting)
         info = _masked(self._episodes.step_info(), active)
         info |= _masked({"is_success": truncated.copy()}, ended)
-        self._ended = ended
+        self._ended = ended.copy()
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
             info = self._same_step(info, ended)
         info |= _masked(self._episodes.state_info(), np.ones(self.num_envs, np.bool_))

@@ -201,6 +201,7 @@ class World:
         self.coefficients[row] = trajectory.coefficients
         self.duration_s[row] = trajectory.duration_s
         self.step_count[row] = 0
+        self.measurements.loss[row] = 0
         away = np.hypot(*(robots[:, :2] - trajectory.at(0.0)[:, :2]).T)
         apart = float(np.hypot(*(robots[1, :2] - robots[0, :2])))
         self.measurements.separation_tracked_m[row] = apart if away.max() <= self._tracking_distance else np.nan
@@ -237,8 +238,11 @@ class World:
         return m
 
     def time_s(self) -> Floats:
-        """Return the time of the current control instant (n,) in s."""
-        return self.step_count.astype(np.float64) * self.period_s
+        """Return the time (n,) in s: the control instant, or the substep at which control was lost."""
+        m = self.measurements
+        instant = self.step_count.astype(np.float64) * self.period_s
+        lost = (self.step_count - 1) * self.period_s + m.substeps * (self.period_s / self.substeps)
+        return np.where(m.loss > 0, lost, instant)
 
     def references(self) -> Floats:
         """Return the references (n, 2, 3) at the current control instants: x, y (m), heading (rad)."""

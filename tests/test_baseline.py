@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import ast
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from recorded import a_record
 
 from agents import baseline, pid
 from agents.baseline import PAPER_GAINS, Baseline, paper_baseline, tuned_baseline
 from agents.pid import PIDState
+from agents.records import Record
 from agents.tune import BOUNDS, cost, gains_of
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import to_cartesian
@@ -155,19 +158,20 @@ def test_the_papers_controller_takes_no_warm_start(observations: Observations) -
     np.testing.assert_array_equal(*actions)
 
 
-def test_the_tuned_controller_starts_from_the_present_poses(make_env: Any) -> None:
+def test_a_warm_start_finds_a_solution_near_the_present_poses(make_env: Any) -> None:
     env = make_env(scenario="random", action="pose", n_epm=3)
-    moved = []
-    for controller in (tuned_baseline(3), paper_baseline(3)):
+    moved_m = {}
+    for warm in (True, False):
+        controller = Baseline("", PAPER_GAINS, warm_start=warm, n_epm=3)
         controller.seed(1)
         state, centres = None, []
         observation, _ = env.reset(seed=1)
-        for _ in range(3):
+        for _ in range(4):
             action, state = controller.predict(observation, state)
             observation, *_, info = env.step(action)
             centres.append(to_cartesian(info["epm_pose"])[0])
-        moved.append(np.linalg.norm(np.diff(centres, axis=0), axis=-1).max())
-    assert moved[0] < 0.05 < 0.1 < moved[1]
+        moved_m[warm] = np.linalg.norm(np.diff(centres, axis=0), axis=-1).max()
+    assert moved_m[True] < 0.05 < 0.1 < moved_m[False]
 
 
 def test_the_tuned_controller_draws_nothing_where_its_warm_start_serves(make_env: Any) -> None:
@@ -217,10 +221,17 @@ def test_bad_input_is_refused(n_epm: int, control_hz: float) -> None:
         paper_baseline(n_epm, control_hz)
 
 
-def test_tuning_prefers_gains_that_hold_to_gains_that_lose() -> None:
-    firm = np.log([0.1, 1e-4, 1e-4, 4e-5, 1e-8, 1e-8])
-    feeble = np.log([low for low, _ in BOUNDS.values()])
-    gains = gains_of(firm)
-    assert list(vars(gains)) == list(BOUNDS)
-    assert (gains.force_p, gains.torque_p) == pytest.approx((0.1, 4e-5))
-    assert cost(firm, 1, 2.0) < 0.5 * cost(feeble, 1, 2.0)
+def test_tuning_weighs_errors_and_lost_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def recorded(controller: Baseline, scenario: str, **settings: Any) -> list[Record]:
+        asked.update(settings, controller=controller.name, scenario=scenario)
+        return [a_record(), a_record(held_steps=20)]
+
+    monkeypatch.setattr("agents.tune.run", recorded)
+    error = 0.5 / 1.0 + math.degrees(2e-3) / 2.0  # 0.5 mm and 2 mrad in the cost's units, in both episodes
+    lost = 100.0 * (2 - 10.0 / 100)  # the second is lost after 10 s
+    logarithms = np.log([low for low, _ in BOUNDS.values()])
+    assert cost(logarithms, 2, 4.0) == pytest.approx(error + lost / 2)
+    assert asked == {"controller": "candidate", "scenario": "random", "control_hz": 4.0, "episodes": 2, "seed": 1000}
+    assert vars(gains_of(logarithms)) == pytest.approx({name: low for name, (low, _) in BOUNDS.items()})

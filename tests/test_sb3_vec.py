@@ -14,16 +14,20 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.sb3_vec import EPISODE_KEYS, TwoRobotsVecEnv
 from magenv.episodes import Settings
+from magenv.params import PLANTS, Body, Plant
 from magenv.task import unpack
 
 Floats = NDArray[np.float64]
 
-WRENCH = Settings(scenario="approach-60", action="wrench", frame="global", control_hz=0.5)
-"""Fifty steps an episode, and an action that a law of one line can hold the robots with."""
+WRENCH = Settings(scenario="approach-60", plant="sticky", action="wrench", frame="global", control_hz=0.5)
+"""Fifty steps an episode, and a plant and an action with which a law of one line can hold the robots."""
 
 
 @pytest.fixture
-def venv() -> Iterator[TwoRobotsVecEnv]:
+def venv(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoRobotsVecEnv]:
+    """Return four episodes on WRENCH, of seeds 20 to 23."""
+    body = Body(drag_linear_nspm=1.0, drag_rotational_nmsprad=5e-4)
+    monkeypatch.setitem(PLANTS, "sticky", Plant(body=body))
     made = TwoRobotsVecEnv(4, WRENCH, seed=20)
     yield made
     made.close()
@@ -31,7 +35,7 @@ def venv() -> Iterator[TwoRobotsVecEnv]:
 
 def actions_for(observations: NDArray[np.float32], layout: Any, rng: np.random.Generator) -> NDArray[np.float32]:
     """Return actions (4, 6) that hold the first two rows' robots and push the others' about."""
-    pull = np.array([2.0, 2.0, 0.02]) * unpack(observations, layout).error
+    pull = np.array([10.0, 10.0, 0.1]) * unpack(observations, layout).error
     actions = np.clip(pull.reshape(len(observations), 6), -1.0, 1.0)
     actions[2:] = rng.uniform(-1.0, 1.0, actions[2:].shape)
     return actions.astype(np.float32)
