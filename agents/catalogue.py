@@ -41,6 +41,6 @@ def controller(name: str, n_epm: int = 2, control_hz: float = 2.0) -> Controller
     require(
         known or (Path(name) / CARD).is_file(), "controller", f"one of {', '.join(names())} or a model's folder", name
     )
-    agent = Learned(shipped, name) if known else Learned(Path(name))
+    agent = Learned(shipped, name) if known else Learned(Path(name), name)
     agent.check(n_epm, control_hz)
     return agent

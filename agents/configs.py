@@ -16,7 +16,8 @@ Algo = Literal["ppo", "sac"]
 _WIDTH_MAX, _DEPTH_MAX = 4096, 8
 
 
-def _check_net(net: tuple[int, ...]) -> None:
+def check_net(net: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` unless ``net`` is a sensible sequence of layer widths."""
     fits = 1 <= len(net) <= _DEPTH_MAX and all(isinstance(w, int) and 1 <= w <= _WIDTH_MAX for w in net)
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
 
@@ -50,7 +51,7 @@ class PPOConfig:
     """Widths of the hidden layers of policy and value function."""
 
     def __post_init__(self) -> None:
-        _check_net(self.net)
+        check_net(self.net)
         _check_positive(
             n_envs=self.n_envs,
             n_steps=self.n_steps,
@@ -82,7 +83,7 @@ class SACConfig:
     """Widths of the hidden layers of actor and critic."""
 
     def __post_init__(self) -> None:
-        _check_net(self.net)
+        check_net(self.net)
         _check_positive(
             n_envs=self.n_envs,
             gradient_steps=self.gradient_steps,

@@ -27,15 +27,15 @@ class TwoRobotsVecEnv(VecEnv):
     def __init__(self, n: int, settings: Settings, seed: int) -> None:
         self._env = TwoRobotsVector(n, **vars(settings), autoreset_mode=AutoresetMode.SAME_STEP)
         super().__init__(n, self._env.single_observation_space, self._env.single_action_space)
-        self._first_seed: int | None = seed
+        self.seed(seed)
         self._actions: NDArray[np.float32] = np.zeros((n, 0), np.float32)
         self._sums = {key: np.zeros(n) for key in (*EPISODE_KEYS, "reward")}
         self._lengths = np.zeros(n, np.int64)
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin all episodes; the first time from the seed, then further along the same random streams."""
-        observations, _ = self._env.reset(seed=self._first_seed)
-        self._first_seed = None
+        """Begin all episodes; after ``seed`` from there, else further along the same random streams."""
+        observations, _ = self._env.reset(seed=list(self._seeds))
+        self._reset_seeds()
         for total in self._sums.values():
             total[:] = 0.0
         self._lengths[:] = 0

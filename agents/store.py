@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import shutil
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from agents.configs import check_net
 from magenv.episodes import Settings
 from magenv.params import require
 
@@ -75,23 +76,29 @@ def save(
 ) -> None:
     """Write a model folder whole or not at all; a folder that stood there is replaced."""
     folder = Path(folder)
+    foreign = folder.exists() and not (folder / CARD).is_file()
+    require(not foreign, "out", "a new folder or a model's, which is replaced", str(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    new, old = folder.with_name(folder.name + ".new"), folder.with_name(folder.name + ".old")
-    for leftover in (new, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    new.mkdir()
-    (new / CARD).write_text(json.dumps({"format": FORMAT} | dataclasses.asdict(card), indent=1) + "\n")
-    tensors = {f"policy.{name}": value.detach().cpu().contiguous() for name, value in policy.items()}
-    tensors[_MEAN] = torch.from_numpy(np.array(normalisation.mean))
-    tensors[_VARIANCE] = torch.from_numpy(np.array(normalisation.variance))
-    tensors[_COUNT] = torch.tensor([normalisation.count], dtype=torch.float64)
-    save_file(tensors, new / POLICY)
-    if training is not None:
-        save_file({name: value.detach().cpu().contiguous() for name, value in training.items()}, new / TRAINING)
-    if folder.exists():
+    with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as scratch:
+        new, old = Path(scratch) / "new", Path(scratch) / "old"
+        new.mkdir()
+        (new / CARD).write_text(json.dumps({"format": FORMAT} | dataclasses.asdict(card), indent=1) + "\n")
+        tensors = {f"policy.{name}": value.detach().cpu().contiguous() for name, value in policy.items()}
+        tensors[_MEAN] = torch.from_numpy(np.array(normalisation.mean))
+        tensors[_VARIANCE] = torch.from_numpy(np.array(normalisation.variance))
+        tensors[_COUNT] = torch.tensor([normalisation.count], dtype=torch.float64)
+        save_file(tensors, new / POLICY)
+        if training is not None:
+            save_file({name: value.detach().cpu().contiguous() for name, value in training.items()}, new / TRAINING)
+        if not folder.exists():
+            os.replace(new, folder)
+            return
         os.replace(folder, old)
-    os.replace(new, folder)
-    shutil.rmtree(old, ignore_errors=True)
+        try:
+            os.replace(new, folder)
+        except OSError:
+            os.replace(old, folder)
+            raise
 
 
 def load_card(folder: Path) -> Card:
@@ -106,16 +113,26 @@ def load_card(folder: Path) -> Card:
     require(path.is_file(), "model", f"a folder with {CARD}", str(folder))
     try:
         raw = json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"Input model must be a magenv model; instead received {path}, which is not JSON.") from error
     told = raw.pop("format", None) if isinstance(raw, dict) else None
     require(told == FORMAT, "model", f"a card of format {FORMAT!r}", told)
     try:
         raw["settings"] = Settings(**raw["settings"])
         raw["net"] = tuple(raw["net"])
-        return Card(**raw)
+        card = Card(**raw)
     except (KeyError, TypeError) as error:
         raise ValueError(f"Input model must have a whole card; instead received {path} ({error}).") from error
+    check_net(card.net)
+    for name, value, kind in (
+        ("algo", card.algo, str),
+        ("steps", card.steps, int),
+        ("config", card.config, dict),
+        ("versions", card.versions, dict),
+        ("command", card.command, str),
+    ):
+        require(isinstance(value, kind), f"model's {name}", f"of type {kind.__name__}", value)
+    return card
 
 
 def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
@@ -129,9 +146,11 @@ def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
     tensors = _load_tensors(Path(folder) / POLICY)
     for name in (_MEAN, _VARIANCE, _COUNT):
         require(name in tensors, "model", f"weights with {name}", str(Path(folder) / POLICY))
-    mean, variance, count = (tensors.pop(name).numpy().astype(np.float64) for name in (_MEAN, _VARIANCE, _COUNT))
-    finite = all(bool(torch.isfinite(value).all()) for value in tensors.values()) and bool(np.isfinite(mean).all())
+    finite = all(bool(torch.isfinite(value).all()) for value in tensors.values())
     require(finite, "model", "finite weights", str(Path(folder) / POLICY))
+    mean, variance, count = (tensors.pop(name).numpy().astype(np.float64) for name in (_MEAN, _VARIANCE, _COUNT))
+    sound = bool((variance >= 0).all()) and count.shape == (1,)
+    require(sound, "model", "sound observation statistics", str(Path(folder) / POLICY))
     policy = {name.removeprefix("policy."): value for name, value in tensors.items()}
     return policy, Normalisation(mean, variance, float(count[0]))
 

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 TOUCH = 1
 WALL = 2
-_CONTACT_TURNS = 20
+_CONTACT_TURNS = 200
 
 
 class Physics(NamedTuple):

@@ -51,7 +51,7 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
     except (TypeError, ValueError):
         raise ValueError(f"Input action must be {must_be}; instead received {action!r}.") from None
     require(numbers.shape == shape, "action", must_be, numbers.shape)
-    require(bool(np.isfinite(numbers).all()), "action", "finite", numbers[~np.isfinite(numbers)].tolist())
+    require(bool(np.isfinite(numbers).all()), "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
     return np.clip(numbers, -1.0, 1.0)
 
 

@@ -144,7 +144,7 @@ PLANTS: dict[str, Plant] = {"paper": Plant()}
 """The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation."""
 
 
-CONTROL_HZ_RANGE = (0.1, 1000.0)
+CONTROL_HZ_RANGE = (0.01, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -184,5 +184,5 @@ class TaskParams:
 
 def choose(table: dict[str, Plant], name: str, value: str) -> Plant:
     """Return ``table[value]`` or raise ``ValueError`` naming the known keys."""
-    require(value in table, name, "one of " + ", ".join(sorted(table)), value)
+    require(isinstance(value, str) and value in table, name, "one of " + ", ".join(sorted(table)), value)
     return table[value]

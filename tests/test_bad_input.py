@@ -29,6 +29,7 @@ MakeEnv = Callable[..., TwoRobots]
 MODES: tuple[ActionMode, ...] = get_args(ActionMode)
 SCENARIOS = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
 POSITIVE = "a positive, finite number"
+CONTROL_HZ = "a number from 0.01 to 1000.0"
 NOT_NEGATIVE = "a finite number of at least 0"
 
 
@@ -63,12 +64,12 @@ ARGUMENTS: list[tuple[dict[str, Any], str, str]] = [
     ({"action": None}, "action", "one of home, pose, step, wrench"),
     ({"observation": "some"}, "observation", "one of full, errors"),
     ({"frame": "moon"}, "frame", "one of robots, global"),
-    ({"control_hz": 0}, "control_hz", POSITIVE),
-    ({"control_hz": -2.0}, "control_hz", POSITIVE),
-    ({"control_hz": math.inf}, "control_hz", POSITIVE),
-    ({"control_hz": math.nan}, "control_hz", POSITIVE),
-    ({"control_hz": "2"}, "control_hz", POSITIVE),
-    ({"control_hz": None}, "control_hz", POSITIVE),
+    ({"control_hz": 0}, "control_hz", CONTROL_HZ),
+    ({"control_hz": -2.0}, "control_hz", CONTROL_HZ),
+    ({"control_hz": math.inf}, "control_hz", CONTROL_HZ),
+    ({"control_hz": math.nan}, "control_hz", CONTROL_HZ),
+    ({"control_hz": "2"}, "control_hz", CONTROL_HZ),
+    ({"control_hz": None}, "control_hz", CONTROL_HZ),
 ]
 
 
@@ -284,7 +285,7 @@ def test_workspace_holds_the_body() -> None:
         Plant(workspace_radius_m=0.01)
 
 
-@pytest.mark.parametrize("name", ["loss_distance_m", "control_hz", "tracking_distance_m"])
+@pytest.mark.parametrize("name", ["loss_distance_m", "tracking_distance_m"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf])
 def test_task_is_positive(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=told(name, POSITIVE, value)):

@@ -17,6 +17,7 @@ from agents.baseline import PAPER_GAINS, Baseline, paper_baseline, tuned_baselin
 from agents.pid import PIDState
 from agents.records import Record
 from agents.tune import BOUNDS, cost, gains_of
+from magenv.allocation import allocate
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import to_cartesian
 from magenv.task import Layout
@@ -127,7 +128,7 @@ def test_its_seed_fixes_its_actions_and_its_state_its_memory(observations: Obser
         for k, controller in enumerate((one, two)):
             action, states[k] = controller.predict(observation, states[k], np.zeros(1, np.bool_))
             actions.append(action)
-        np.testing.assert_array_equal(*actions)
+        np.testing.assert_array_equal(actions[0], actions[1])
     one.seed(8)
     two.seed(9)
     assert not np.array_equal(one.predict(observations[0])[0], two.predict(observations[0])[0])
@@ -142,20 +143,42 @@ def test_an_episode_that_starts_forgets_its_integral_alone(observations: Observa
     np.testing.assert_allclose(state.integral[1], 2 * first[1])
 
 
-def with_epms_of(observations: Observations, row: int, other: int) -> Observations:
-    """Return the observation of ``row`` with the EPMs of another."""
-    mixed = observations[row].copy()
-    mixed[_FIRST_EPM:] = observations[other][_FIRST_EPM:]
-    return mixed
+@pytest.fixture
+def with_other_epms(observations: Observations, make_env: Any) -> Observations:
+    """Return the first observation twice, the second time with the EPMs elsewhere; at all starts they are at home."""
+    env = make_env(scenario="random")
+    env.reset(seed=0)
+    away = env.step(np.full(10, 0.5, np.float32))[0]
+    rows = np.stack([observations[0], observations[0]])
+    rows[1, _FIRST_EPM:] = away[_FIRST_EPM:]
+    assert not np.array_equal(rows[0], rows[1])
+    return rows
 
 
-def test_the_papers_controller_takes_no_warm_start(observations: Observations) -> None:
+@pytest.mark.parametrize("make", [paper_baseline, tuned_baseline])
+def test_only_the_tuned_controller_takes_a_warm_start(
+    with_other_epms: Observations, make: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper's: ten random starts, nothing else; the present poses do not count."""
+    asked: list[dict[str, Any]] = []
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        asked.append(options)
+        return allocate(*arguments, **options)
+
+    monkeypatch.setattr("agents.baseline.allocate", watched)
     actions = []
-    for observation in (observations[1], with_epms_of(observations, 1, 3)):
-        controller = paper_baseline()
+    for observation in with_other_epms:
+        controller = make()
         controller.seed(0)
         actions.append(controller.predict(observation)[0])
-    np.testing.assert_array_equal(*actions)
+    assert [options["starts"] for options in asked] == [10, 10]
+    if make is paper_baseline:
+        assert all(options["initial"] is None and not options["stop_early"] for options in asked)
+        np.testing.assert_array_equal(actions[0], actions[1])
+    else:
+        assert all(options["stop_early"] for options in asked)
+        assert not np.array_equal(asked[0]["initial"], asked[1]["initial"])
 
 
 def test_a_warm_start_finds_a_solution_near_the_present_poses(make_env: Any) -> None:
@@ -181,7 +204,7 @@ def test_the_tuned_controller_draws_nothing_where_its_warm_start_serves(make_env
         controller = tuned_baseline(3)
         controller.seed(seed)
         actions.append(controller.predict(observation)[0])
-    np.testing.assert_array_equal(*actions)
+    np.testing.assert_array_equal(actions[0], actions[1])
 
 
 def test_its_nominal_parameters_stand_apart_from_the_plants(

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from agents.command import friendly
 from agents.configs import TrainConfig
 from agents.learned import Learned
 from agents.learning import checkpoints, train
@@ -224,7 +225,7 @@ BAD = {
     "n_epm 0": ("evaluate.py", ["--controllers", "idle", "--n-epm", "0"], "2 or 3.*0"),
     "n_epm 0 of the baseline": ("evaluate.py", ["--controllers", "baseline", "--n-epm", "0"], "n_epm.*0"),
     "n_epm 1": ("evaluate.py", ["--controllers", "idle", "--n-epm", "1"], "2 or 3.*1"),
-    "control_hz": ("evaluate.py", ["--controllers", "idle", "--control-hz", "0"], "positive.*0.0"),
+    "control_hz": ("evaluate.py", ["--controllers", "idle", "--control-hz", "0"], "control_hz.*0.0"),
     "no model": ("evaluate.py", ["--controllers", "runs/nothing"], "model's folder.*'runs/nothing'"),
     "option": ("evaluate.py", ["--controler", "idle"], "--controler"),
     "number": ("evaluate.py", ["--n-epm", "two"], "n-epm.*'two'"),
@@ -296,6 +297,34 @@ def test_a_foreign_model_is_refused(
     assert "Input model must" in line
     assert tree(tmp_path) == before
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (ValueError("Input action must be finite; instead received [[nan\n 1.]]."), 2, r"error: .*\[\[nan 1\.\]\]\.\n"),
+        (OSError(28, "No space left on device", "/full"), 2, "error: .*No space left.*\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_an_end_by_error_is_told_in_one_line(
+    error: BaseException, code: int, line: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def main() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as end:
+        friendly(main)
+    assert end.value.code == code
+    assert re.fullmatch(line, capfd.readouterr().err)
+
+
+def test_a_fault_of_our_own_keeps_its_traceback() -> None:
+    def main() -> None:
+        raise RuntimeError("a fault")
+
+    with pytest.raises(RuntimeError, match="a fault"):
+        friendly(main)
 
 
 @pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
