@@ -142,7 +142,9 @@ def test_a_miss_is_a_local_minimum(seed: int, n_epm: int) -> None:
 @pytest.mark.parametrize("n_epm", [2, 3])
 def test_a_miss_is_told_as_stationary(n_epm: int) -> None:
     """The iterations are enough to find most minima: the status says so."""
-    statuses = [allocate(*unreachable(seed, n_epm), seed=seed, starts=3, max_iterations=3000).status for seed in range(8)]
+    statuses = [
+        allocate(*unreachable(seed, n_epm), seed=seed, starts=3, max_iterations=3000).status for seed in range(8)
+    ]
     assert statuses.count("stationary") >= 6
 
 
