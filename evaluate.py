@@ -9,10 +9,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on tw
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from agents.catalogue import controller, names
-from agents.command import command_line, friendly
+from agents.command import command_line, friendly, parse
 from agents.comparison import compare
 
 
@@ -42,7 +40,7 @@ class EvaluateConfig:
 
 def main() -> None:
     """Evaluate, report."""
-    c = tyro.cli(EvaluateConfig, description=EvaluateConfig.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    c = parse(EvaluateConfig)
     if c.list:
         print("\n".join(names()))
         return

@@ -6,10 +6,8 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
 
-import tyro
-
 from agents.catalogue import controller
-from agents.command import command_line, friendly
+from agents.command import command_line, friendly, parse
 from agents.comparison import compare
 from agents.configs import TrainConfig
 from agents.learned import Learned
@@ -21,15 +19,15 @@ SCENARIOS = ("approach-60", "approach-30")
 
 def main() -> None:
     """Train, evaluate, report."""
-    config = tyro.cli(TrainConfig, description=TrainConfig.__doc__)
+    config = parse(TrainConfig)
     folder, finished = train(config, command_line())
     if not finished:
-        print(f"Stopped early; model: {folder}, to go on: python train.py --resume {config.out}")
+        print(f"Stopped early; model: {folder}, to go on: python train.py --resume {config.folder}")
         raise KeyboardInterrupt
     agent = Learned(folder)
     s = agent.settings
     floor = [controller(name, s.n_epm, s.control_hz) for name in ("baseline", "idle", "random")]
-    compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, config.out, command_line())
+    compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, config.folder, command_line())
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from agents.controller import Controller
 from agents.records import Record
 from agents.report import check_output_dir, print_table, write_report
 from agents.rollout import run
-from magenv.params import PLANTS, choose, require
-from magenv.trajectories import check_scenario
+from magenv.episodes import Episodes, Settings
+from magenv.params import require
 
 
 def compare(
@@ -43,8 +43,8 @@ def compare(
         len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios
     )
     for scenario in scenarios:
-        check_scenario(scenario)
-    choose(PLANTS, "plant", plant)
+        for c in controllers:
+            Episodes(1, Settings(scenario, plant, n_epm, c.action, c.observation, c.frame, control_hz))
     require(episodes >= 1, "episodes", "at least 1", episodes)
     require(seed >= 0, "seed", "a whole number of at least 0", seed)
     check_output_dir(out)

@@ -22,9 +22,14 @@ def check_net(net: tuple[int, ...]) -> None:
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
 
 
-def _check_positive(**values: float) -> None:
+def _check(kind: type, low: float, high: float, **values: object) -> None:
+    """Raise ``ValueError`` unless all values are finite numbers of the kind, above ``low`` and at most ``high``."""
+    kinds = (int, float) if kind is float else kind
+    whole, most = "whole " if kind is int else "", "" if high == math.inf else f", at most {high:g}"
+    must_be = f"a {'positive ' if low == 0 else ''}{whole}number{'' if low == 0 else f' above {low:g}'}{most}"
     for name, value in values.items():
-        require(math.isfinite(value) and value > 0, name, "a positive, finite number", value)
+        number = isinstance(value, kinds) and not isinstance(value, bool)
+        require(number and math.isfinite(value) and low < value <= high, name, must_be, value)  # type: ignore[arg-type,operator]
 
 
 @dataclass(frozen=True)
@@ -52,13 +57,12 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check_positive(
-            n_envs=self.n_envs,
-            n_steps=self.n_steps,
-            batch_size=self.batch_size,
-            n_epochs=self.n_epochs,
-            learning_rate=self.learning_rate,
-        )
+        _check(int, 0, math.inf, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
+        _check(int, 1, math.inf, batch_size=self.batch_size)
+        _check(float, 0, math.inf, learning_rate=self.learning_rate)
+        _check(float, 0, 1, gamma=self.gamma, gae_lambda=self.gae_lambda)
+        _check(float, -20, 2, log_std_init=self.log_std_init)
+        require(self.n_envs * self.n_steps > 1, "n_steps", "over 1 for a single episode", self.n_steps)
 
 
 @dataclass(frozen=True)
@@ -84,13 +88,11 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check_positive(
-            n_envs=self.n_envs,
-            gradient_steps=self.gradient_steps,
-            batch_size=self.batch_size,
-            learning_rate=self.learning_rate,
-            buffer_size=self.buffer_size,
-        )
+        _check(int, 0, math.inf, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
+        _check(int, 0, math.inf, buffer_size=self.buffer_size)
+        _check(int, -1, math.inf, learning_starts=self.learning_starts)
+        _check(float, 0, math.inf, learning_rate=self.learning_rate)
+        _check(float, 0, 1, gamma=self.gamma)
 
 
 STEPS: dict[Algo, int] = {"ppo": 3_000_000, "sac": 200_000}
@@ -121,8 +123,8 @@ class TrainConfig:
     """Environment steps; by default 3 million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
-    out: Path = Path("runs/train")
-    """Folder for model, checkpoints, progress.csv and report."""
+    out: Path | None = None
+    """Folder for model, checkpoints, progress.csv and report; by default runs/train, or that of --resume."""
     resume: Path | None = None
     """Folder of a run to go on with; its configuration counts, but for --steps and --out."""
     checkpoint_every: int = 250_000
@@ -131,9 +133,16 @@ class TrainConfig:
     sac: SACConfig = field(default_factory=SACConfig)
 
     def __post_init__(self) -> None:
-        require(self.steps is None or self.steps > 0, "steps", "a positive whole number", self.steps)
-        require(self.seed >= 0, "seed", "a whole number of at least 0", self.seed)
-        _check_positive(checkpoint_every=self.checkpoint_every)
+        require(self.algo in STEPS, "algo", " or ".join(STEPS), self.algo)
+        if self.steps is not None:
+            _check(int, 0, math.inf, steps=self.steps)
+        _check(int, -1, math.inf, seed=self.seed)
+        _check(int, 0, math.inf, checkpoint_every=self.checkpoint_every)
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder: ``out``, or that of the run gone on with."""
+        return self.out or self.resume or Path("runs/train")
 
     @property
     def settings(self) -> Settings:

@@ -98,16 +98,21 @@ class Learned:
         return cast("NDArray[np.float32]", action), None
 
 
+def load_weights(policy: BasePolicy, weights: dict[str, torch.Tensor]) -> None:
+    """Put the weights into the policy network, or raise ``ValueError`` where they do not fit it."""
+    try:
+        policy.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ValueError(f"Input model must have weights that fit its card; instead received {reason}.") from error
+
+
 def _build(
     card: Card, weights: dict[str, torch.Tensor], observation_space: spaces.Box, action_space: spaces.Box
 ) -> BasePolicy:
     """Return the policy network with the weights, or raise ``ValueError`` where they do not fit it."""
     kwargs = policy_kwargs(card.algo, card.net)
     policy: BasePolicy = _POLICIES[card.algo](observation_space, action_space, lr_schedule=lambda _: 0.0, **kwargs)
-    try:
-        policy.load_state_dict(weights)
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ValueError(f"Input model must have weights that fit its card; instead received {reason}.") from error
+    load_weights(policy, weights)
     policy.set_training_mode(False)
     return policy

@@ -6,8 +6,10 @@ last two) and, at the end, ``model``.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
+import shutil
 import sys
 from collections import deque
 from pathlib import Path
@@ -20,15 +22,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.configs import PPOConfig, SACConfig, TrainConfig
-from agents.learned import CLIP_OBSERVATION, policy_kwargs
+from agents.learned import CLIP_OBSERVATION, load_weights, policy_kwargs
+from agents.report import check_output_dir
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import (
     Card,
     Normalisation,
+    check_replaceable,
     flatten,
     load_card,
     load_policy,
@@ -45,7 +49,7 @@ _OPTIMISERS = {"ppo": ("policy.optimizer",), "sac": ("actor.optimizer", "critic.
 
 def _falling(start: float) -> Any:
     """Return a learning rate that falls linearly from ``start`` to a tenth."""
-    return lambda remaining: start * (0.1 + 0.9 * remaining)
+    return lambda remaining: start * (0.1 + 0.9 * max(remaining, 0.0))  # whole rollouts may end beyond the plan
 
 
 def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
@@ -120,30 +124,43 @@ def save_model(
 
 
 def restore(folder: Path, model: BaseAlgorithm, env: VecNormalize, algo: str) -> None:
-    """Put a checkpoint's weights, optimisers, statistics and step count into a model built from its configuration."""
+    """Put a checkpoint's weights, optimisers, statistics and step count into a model built from its configuration.
+
+    Raises
+    ------
+    ValueError
+        If they do not fit the model.
+    """
     weights, normalisation = load_policy(folder)
-    model.policy.load_state_dict(weights)
+    load_weights(model.policy, weights)
     flat = load_training(folder)
     for name in _OPTIMISERS[algo]:
         optimiser = _attribute(model, name)
         stored = {key.removeprefix(f"{name}."): value for key, value in flat.items() if key.startswith(f"{name}.")}
-        optimiser.load_state_dict(_optimiser_state(optimiser.state_dict(), stored))
+        optimiser.load_state_dict(_optimiser_state(optimiser, stored))
     if isinstance(model, SAC):
         assert model.log_ent_coef is not None
-        model.log_ent_coef.data.copy_(flat["log_ent_coef"])
+        model.log_ent_coef.data.copy_(unflatten_like(model.log_ent_coef, flat, "log_ent_coef"))
     statistics: Any = env.obs_rms
+    shape = statistics.mean.shape
+    require(normalisation.mean.shape == shape, "checkpoint", f"statistics of shape {shape}", normalisation.mean.shape)
     statistics.mean, statistics.var = normalisation.mean, normalisation.variance
     statistics.count = normalisation.count
     model.num_timesteps = load_card(folder).steps
 
 
-def _optimiser_state(fresh: dict[str, Any], stored: dict[str, torch.Tensor]) -> dict[str, Any]:
-    """Return an optimiser's state dictionary from its flattened form; a fresh one has no moments to take as pattern."""
-    groups = unflatten_like(fresh["param_groups"], stored, "param_groups")
+def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.Tensor]) -> dict[str, Any]:
+    """Return an optimiser's state dictionary from its flattened form, checked against the parameters it is for."""
+    groups = unflatten_like(optimiser.state_dict()["param_groups"], stored, "param_groups")
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in stored.items():
         part = key.split(".")
         if part[0] == "state":
+            known = len(part) == 3 and part[1].isdigit() and int(part[1]) < len(parameters)
+            require(known, "checkpoint", "of optimisers of this model", key)
+            shape = parameters[int(part[1])].shape if part[2] != "step" else torch.Size()
+            require(value.shape == shape, f"checkpoint's {key}", f"of shape {tuple(shape)}", tuple(value.shape))
             state.setdefault(int(part[1]), {})[part[2]] = value
     return {"state": state, "param_groups": groups}
 
@@ -164,7 +181,7 @@ def resumed(config: TrainConfig) -> tuple[TrainConfig, Path]:
         raw["ppo"], raw["sac"] = (
             cls(**(raw[key] | {"net": tuple(raw[key]["net"])})) for key, cls in (("ppo", PPOConfig), ("sac", SACConfig))
         )
-        raw |= {"out": config.out, "resume": config.resume, "steps": config.steps or raw["steps"]}
+        raw |= {"out": config.folder, "resume": config.resume, "steps": config.steps or raw["steps"]}
         old = TrainConfig(**raw)
     except (KeyError, TypeError) as error:
         raise ValueError(
@@ -177,11 +194,13 @@ def resumed(config: TrainConfig) -> tuple[TrainConfig, Path]:
 class _Progress(BaseCallback):
     """Progress bar with time left, training statistics, checkpoints."""
 
-    def __init__(self, config: TrainConfig, env: VecNormalize, command: str) -> None:
+    def __init__(self, model: BaseAlgorithm, config: TrainConfig, env: VecNormalize, command: str) -> None:
         super().__init__()
+        self.model = model
         self._config, self._env, self._command = config, env, command
         self._episodes: deque[dict[str, Any]] = deque(maxlen=_RECENT_EPISODES)
         self._next_checkpoint = 0
+        self._kept = checkpoints(config.folder) if config.resume is not None else []
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(),
@@ -202,79 +221,111 @@ class _Progress(BaseCallback):
 
     def _on_step(self) -> bool:
         self._episodes.extend(info for info in self.locals["infos"] if "is_success" in info)
-        told = ""
-        if self._episodes:
-            means = {
-                key: float(np.mean([e[key] for e in self._episodes]))
-                for key in ("is_success", "position_error_m", "heading_error_rad")
-            }
-            position, heading = 1e3 * means["position_error_m"], math.degrees(means["heading_error_rad"])
-            told = f"success {means['is_success']:.0%}  {position:.1f} mm  {heading:.1f} deg"
-            self.logger.record("episodes/success_rate", means["is_success"])
-            self.logger.record("episodes/position_error_mm", position)
-            self.logger.record("episodes/heading_error_deg", heading)
-        self._bar.update(self._task, completed=self.num_timesteps, told=told)
+        self._bar.update(self._task, completed=self.num_timesteps, told=self._record())
         if self.num_timesteps >= self._next_checkpoint:
             self._next_checkpoint += self._config.checkpoint_every
             self.checkpoint()
         return True
 
+    def _record(self) -> str:
+        """Log the means of the last episodes, and return them for the bar."""
+        if not self._episodes:
+            return ""
+        keys = ("is_success", "position_error_m", "heading_error_rad")
+        success, position, heading = (float(np.mean([episode[key] for episode in self._episodes])) for key in keys)
+        self.logger.record("episodes/success_rate", success)
+        self.logger.record("episodes/position_error_mm", 1e3 * position)
+        self.logger.record("episodes/heading_error_deg", math.degrees(heading))
+        return f"success {success:.0%}  {1e3 * position:.1f} mm  {math.degrees(heading):.1f} deg"
+
     def _on_training_end(self) -> None:
         self._bar.stop()
 
     def checkpoint(self) -> None:
-        """Write a checkpoint and drop all but the last two."""
-        folder = self._config.out / "checkpoints" / f"step-{self.num_timesteps:012d}"
+        """Write a checkpoint; drop all but this run's last two."""
+        folder = self._config.folder / "checkpoints" / f"step-{self.num_timesteps:012d}"
         save_model(folder, self.model, self._env, self._config, True, self._command)
-        for old in checkpoints(self._config.out)[:-KEPT_CHECKPOINTS]:
-            _remove(old)
+        self._kept = [*(kept for kept in self._kept if kept != folder), folder][-KEPT_CHECKPOINTS:]
+        for other in folder.parent.iterdir():  # of this run, of an older one in its place, or half written
+            if other.name.startswith("step-") and other not in self._kept:
+                shutil.rmtree(other)
 
     def close(self) -> None:
-        """Stop drawing the bar."""
+        """Stop drawing the bar, tell the logs where the training ended."""
         self._bar.stop()
-
-
-def _remove(folder: Path) -> None:
-    for file in folder.iterdir():
-        file.unlink()
-    folder.rmdir()
+        self._record()
+        self.logger.record("time/total_timesteps", self.model.num_timesteps)
+        self.logger.dump(self.model.num_timesteps)
+        self.logger.close()
 
 
 def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
     """Train as configured; return the model's folder and whether the training ran to its end.
 
-    Ctrl-C ends it early: model and checkpoint are written all the same.
+    Ctrl-C ends it early: model and checkpoint are written all the same, unless nothing was learned yet.
 
     Raises
     ------
     ValueError
         If the configuration, or the run to go on with, is unsound.
+    KeyboardInterrupt
+        If Ctrl-C came before the first step.
     """
     torch.set_num_threads(1)  # two threads on two cores spin: ten times slower
     start: Path | None = None
     if config.resume is not None:
         config, start = resumed(config)
     model, env = build(config)
-    config.out.mkdir(parents=True, exist_ok=True)
-    model.set_logger(configure(str(config.out), _log_formats()))
     if start is not None:
         restore(start, model, env, config.algo)
-    progress = _Progress(config, env, command)
-    finished = True
+        # Not the first run's episodes again.
+        env.seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
+        if isinstance(model, SAC):  # the replay buffer is not stored: fill it first
+            model.learning_starts += model.num_timesteps
+    folder = config.folder / "model"
+    check_output_dir(config.folder)
+    check_replaceable(folder)
+    begun, finished = model.num_timesteps, True
+    model.set_logger(_logger(config))
+    progress = _Progress(model, config, env, command)
     try:
-        remaining = config.total_steps - model.num_timesteps
-        model.learn(
-            remaining, callback=progress, reset_num_timesteps=False, log_interval=1 if config.algo == "ppo" else 50
-        )
+        interval = 1 if config.algo == "ppo" else 50
+        model.learn(config.total_steps - begun, progress, reset_num_timesteps=False, log_interval=interval)
     except KeyboardInterrupt:
         finished = False
+        if model.num_timesteps == begun:
+            raise
     finally:
         progress.close()
+        env.close()
     progress.checkpoint()
-    folder = config.out / "model"
     save_model(folder, model, env, config, False, command)
-    env.close()
     return folder, finished
+
+
+def _logger(config: TrainConfig) -> Logger:
+    """Return the logger of a run; what stood in the progress.csv of the run gone on with stands first in its own."""
+    past = config.resume / "progress.csv" if config.resume is not None else None
+    rows: list[dict[str, Any]] = []
+    if past is not None and past.is_file():
+        with past.open(newline="") as file:
+            rows = [{key: _number(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+    logger = configure(str(config.folder), _log_formats())
+    for output in logger.output_formats:
+        if isinstance(output, CSVOutputFormat):
+            for row in rows:
+                output.write(row, dict.fromkeys(row, ()))
+    return logger
+
+
+def _number(text: str) -> str | float | int:
+    """Return a number where the text is one, as it was written."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def _log_formats() -> list[str]:

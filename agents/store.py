@@ -67,6 +67,12 @@ class Normalisation:
     count: float
 
 
+def check_replaceable(folder: Path) -> None:
+    """Raise ``ValueError`` where something stands in the place of a model's folder that is no model."""
+    foreign = folder.exists() and not (folder / CARD).is_file()
+    require(not foreign, "out", "a place for a model, not one of something else", str(folder))
+
+
 def save(
     folder: Path,
     card: Card,
@@ -75,9 +81,7 @@ def save(
     training: Mapping[str, torch.Tensor] | None = None,
 ) -> None:
     """Write a model folder whole or not at all; a folder that stood there is replaced."""
-    folder = Path(folder)
-    foreign = folder.exists() and not (folder / CARD).is_file()
-    require(not foreign, "out", "a new folder or a model's, which is replaced", str(folder))
+    check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from agents.baseline import Baseline
+from agents.command import parse
 from agents.metrics import measure
 from agents.pid import Gains
 from agents.rollout import run
@@ -55,7 +55,7 @@ def cost(logarithms: NDArray[np.float64], episodes: int, control_hz: float) -> f
 
 def main() -> None:
     """Search and print."""
-    config = tyro.cli(TuneConfig, description=TuneConfig.__doc__)
+    config = parse(TuneConfig)
 
     best = np.inf
 

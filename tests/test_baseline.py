@@ -14,9 +14,9 @@ from recorded import a_record
 
 from agents import baseline, pid
 from agents.baseline import PAPER_GAINS, Baseline, paper_baseline, tuned_baseline
-from agents.pid import PIDState
+from agents.pid import Gains, PIDState
 from agents.records import Record
-from agents.tune import BOUNDS, cost, gains_of
+from agents.tune import cost, gains_of
 from magenv.allocation import allocate
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import to_cartesian
@@ -254,7 +254,8 @@ def test_tuning_weighs_errors_and_lost_time(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("agents.tune.run", recorded)
     error = 0.5 / 1.0 + math.degrees(2e-3) / 2.0  # 0.5 mm and 2 mrad in the cost's units, in both episodes
     lost = 100.0 * (2 - 10.0 / 100)  # the second is lost after 10 s
-    logarithms = np.log([low for low, _ in BOUNDS.values()])
+    gains = Gains(force_p=0.1, force_i=0.01, force_d=0.02, torque_p=4e-5, torque_i=1e-6, torque_d=2e-6)
+    logarithms = np.log(list(vars(gains).values()))
     assert cost(logarithms, 2, 4.0) == pytest.approx(error + lost / 2)
     assert asked == {"controller": "candidate", "scenario": "random", "control_hz": 4.0, "episodes": 2, "seed": 1000}
-    assert vars(gains_of(logarithms)) == pytest.approx({name: low for name, (low, _) in BOUNDS.items()})
+    assert vars(gains_of(logarithms)) == pytest.approx(vars(gains))
