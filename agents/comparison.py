@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from agents.controller import Controller
-from agents.records import Record
-from agents.report import check_output_dir, print_table, write_report
+from agents.records import Record, check_output_dir
+from agents.report import print_table, write_report
 from agents.rollout import run
 from magenv.episodes import Episodes, Settings
 from magenv.params import require

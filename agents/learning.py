@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import CLIP_OBSERVATION, load_weights, policy_kwargs
-from agents.report import check_output_dir
+from agents.records import check_output_dir
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import (
     Card,
@@ -200,7 +200,8 @@ class _Progress(BaseCallback):
         self._config, self._env, self._command = config, env, command
         self._episodes: deque[dict[str, Any]] = deque(maxlen=_RECENT_EPISODES)
         self._next_checkpoint = 0
-        self._kept = checkpoints(config.folder) if config.resume is not None else []
+        same = config.resume is not None and config.resume.resolve() == config.folder.resolve()
+        self._kept = checkpoints(config.folder) if same else []
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(),

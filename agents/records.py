@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import tempfile
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -80,6 +81,24 @@ _SCALARS: dict[str, type] = {
 _STATES = ("time_s", "robots", "epm_pose")
 _REFERENCE = "reference"
 _HOLDS = tuple(f.name for f in fields(Record) if f.name not in (*_SCALARS, *_STATES, _REFERENCE))
+
+
+def check_output_dir(folder: Path) -> None:
+    """Make the folder and prove that it can be written, before anything is computed for it.
+
+    Raises
+    ------
+    ValueError
+        If it cannot.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"Input out must be a folder that can be written; instead received {str(folder)!r} ({error.strerror})."
+        ) from error
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -7,7 +7,6 @@ import io
 import json
 import platform
 import re
-import tempfile
 from dataclasses import asdict, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,7 +18,7 @@ from rich.text import Text
 
 from agents import figures
 from agents.metrics import Episode, Interval, Summary, by_controller, by_scenario, measure, summarise
-from agents.records import Record, save, write_file
+from agents.records import Record, check_output_dir, save, write_file
 from agents.replay import animate
 from magenv.params import require
 
@@ -61,24 +60,6 @@ over time are medians, bands 10 to 90 % of the episodes, drawn while at least ha
 The robots can be held at rest only above the separation that a line marks; brief passes below it are possible."""
 
 
-def check_output_dir(folder: Path) -> None:
-    """Make the folder and prove that it can be written, before anything is computed for it.
-
-    Raises
-    ------
-    ValueError
-        If it cannot.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ValueError(
-            f"Input out must be a folder that can be written; instead received {str(folder)!r} ({error.strerror})."
-        ) from error
-
-
 def write_summary(records: list[Record], folder: Path) -> list[Summary]:
     """Write ``summary.json``, ``episodes.csv`` and the records to ``folder``; return the rows of the summary."""
     rows = summarise(records)
@@ -104,7 +85,7 @@ def print_table(rows: list[Summary], console: Console | None = None) -> None:
         table = Table(title=_setting(chosen), title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0)
         table.caption, table.caption_justify = _paper(scenario), "left"
         widest = max(len(row.controller) for row in chosen)
-        table.add_column(_COLUMNS[0], min_width=min(widest, 16), overflow="fold")
+        table.add_column(_COLUMNS[0], min_width=min(max(widest, len(_COLUMNS[0])), 16), overflow="fold")
         for column in _COLUMNS[1:]:
             table.add_column(column.replace(" ", "\n"), justify="right", no_wrap=True)
         for row in chosen:

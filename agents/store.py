@@ -94,14 +94,13 @@ def save(
         save_file(tensors, new / POLICY)
         if training is not None:
             save_file({name: value.detach().cpu().contiguous() for name, value in training.items()}, new / TRAINING)
-        if not folder.exists():
-            os.replace(new, folder)
-            return
-        os.replace(folder, old)
         try:
+            if folder.exists():
+                os.replace(folder, old)
             os.replace(new, folder)
-        except OSError:
-            os.replace(old, folder)
+        except BaseException:  # Ctrl-C as well
+            if old.exists() and not folder.exists():
+                os.replace(old, folder)
             raise
 
 

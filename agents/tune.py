@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from agents.baseline import Baseline
-from agents.command import parse
+from agents.command import friendly, parse
 from agents.metrics import measure
 from agents.pid import Gains
 from agents.rollout import run
@@ -73,4 +73,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    friendly(main)
