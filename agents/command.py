@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import shlex
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -40,6 +41,7 @@ def parse(kind: type[Config]) -> Config:
 
 def friendly(main: Callable[[], None]) -> None:
     """Run ``main``; bad input ends it with one line and exit code 2, Ctrl-C with exit code 130."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are born deaf to it
     try:
         main()
     except (ValueError, OSError) as error:
