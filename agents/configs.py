@@ -57,7 +57,7 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check(int, 0, math.inf, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
+        _check(int, 0, 65_536, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
         _check(int, 1, math.inf, batch_size=self.batch_size)
         _check(float, 0, math.inf, learning_rate=self.learning_rate)
         _check(float, 0, 1, gamma=self.gamma, gae_lambda=self.gae_lambda)
@@ -88,8 +88,8 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check(int, 0, math.inf, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
-        _check(int, 0, math.inf, buffer_size=self.buffer_size)
+        _check(int, 0, 65_536, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
+        _check(int, 0, 10_000_000, buffer_size=self.buffer_size)
         _check(int, -1, math.inf, learning_starts=self.learning_starts)
         _check(float, 0, math.inf, learning_rate=self.learning_rate)
         _check(float, 0, 1, gamma=self.gamma)
@@ -136,7 +136,7 @@ class TrainConfig:
         require(self.algo in STEPS, "algo", " or ".join(STEPS), self.algo)
         if self.steps is not None:
             _check(int, 0, math.inf, steps=self.steps)
-        _check(int, -1, math.inf, seed=self.seed)
+        _check(int, -1, 2**32 - 1, seed=self.seed)
         _check(int, 0, math.inf, checkpoint_every=self.checkpoint_every)
 
     @property

@@ -116,7 +116,7 @@ def load_card(folder: Path) -> Card:
     require(path.is_file(), "model", f"a folder with {CARD}", str(folder))
     try:
         raw = json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"Input model must be a magenv model; instead received {path}, which is not JSON.") from error
     told = raw.pop("format", None) if isinstance(raw, dict) else None
     require(told == FORMAT, "model", f"a card of format {FORMAT!r}", told)
