@@ -16,21 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.allocation import best_of, component_scales
-from magenv.kernels import kernel
+from magenv.kernels import kernel, law
 from magenv.params import System, require
 from magenv.poses import (
     HOME_RADIUS_M,
     POSE_SIZE,
     epm_to_pose,
+    frame_direction,
     home_pose,
     pose_bounds,
     pose_to_epm,
     project_epms,
     robots_frame,
 )
+from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 ActionMode = Literal["home", "pose", "step", "wrench"]
 
 HOME_ANGLE_RAD = 1.2
@@ -47,10 +50,9 @@ _TOLERANCE = 1e-6
 _MAX_ITERATIONS = 60
 
 
-@kernel
-def home_epms(action: Floats, frame: float, home: Floats, r_min: float, epms: Floats) -> None:
-    """Write the EPMs (N, 6) offset by ``action`` (5 N) from ``home`` turned to the robots' frame."""
-    pose = np.empty(POSE_SIZE)
+@law
+def _home_epms(action: Floats, c: float, s: float, home: Floats, r_min: float, pose: Floats, epms: Floats) -> None:
+    """Write the EPMs (N, 6) offset by ``action`` (5 N) from ``home`` in the robots' frame of direction (c, s)."""
     for k in range(len(epms)):
         for i in range(POSE_SIZE):
             a = action[POSE_SIZE * k + i]
@@ -59,26 +61,46 @@ def home_epms(action: Floats, frame: float, home: Floats, r_min: float, epms: Fl
                 pose[i] += a * (HOME_RADIUS_OUT_M if a > 0.0 else HOME_RADIUS_M - r_min)
             else:
                 pose[i] += HOME_ANGLE_RAD * a
-        pose[0] += frame
-        pose[3] += frame
-        pose_to_epm(pose, epms[k])
+        epm = epms[k]
+        pose_to_epm(pose, epm)
+        epm[0], epm[1] = c * epm[0] - s * epm[1], s * epm[0] + c * epm[1]
+        epm[3], epm[4] = c * epm[3] - s * epm[4], s * epm[3] + c * epm[4]
 
 
 @kernel
 def _home_rows(
-    actions: Floats, measured: Floats, home: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
+    first: int,
+    last: int,
+    actions: Floats,
+    measured: Floats,
+    home: Floats,
+    limits: Floats,
+    targets: Floats,
+    projected: Bools,
 ) -> None:
-    for i in range(len(actions)):
-        home_epms(actions[i], robots_frame(measured[i, 0, 2], measured[i, 1, 2]), home, limits[0], targets[i])
+    pose = np.empty(POSE_SIZE)
+    for i in range(first, last):
+        c, s = frame_direction(measured[i, 0, 2], measured[i, 1, 2])
+        _home_epms(actions[i], c, s, home, limits[0], pose, targets[i])
         projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
 
 
 @kernel
+def _start_rows(mask: Bools, measured: Floats, home: Floats, limits: Floats, epms: Floats) -> None:
+    pose, still = np.empty(POSE_SIZE), np.zeros(len(home))
+    for i in range(len(mask)):
+        if mask[i]:
+            c, s = frame_direction(measured[i, 0, 2], measured[i, 1, 2])
+            _home_epms(still, c, s, home, limits[0], pose, epms[i])
+            project_epms(epms[i], limits[0], limits[1], limits[2])
+
+
+@kernel
 def _pose_rows(
-    actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]
+    first: int, last: int, actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: Bools
 ) -> None:
     pose = np.empty(POSE_SIZE)
-    for i in range(len(actions)):
+    for i in range(first, last):
         for k in range(targets.shape[1]):
             for j in range(POSE_SIZE):
                 at = POSE_SIZE * k + j
@@ -88,9 +110,9 @@ def _pose_rows(
 
 
 @kernel
-def _step_rows(actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: NDArray[np.bool_]) -> None:
+def _step_rows(first: int, last: int, actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: Bools) -> None:
     pose = np.empty(POSE_SIZE)
-    for i in range(len(actions)):
+    for i in range(first, last):
         for k in range(targets.shape[1]):
             epm_to_pose(epms[i, k], pose)
             for j in range(POSE_SIZE):
@@ -113,6 +135,8 @@ def planar_target(wrench: Floats, heading_1: float, heading_2: float, target: Fl
 
 @kernel
 def _wrench_rows(
+    first: int,
+    last: int,
     actions: Floats,
     measured: Floats,
     epms: Floats,
@@ -122,14 +146,14 @@ def _wrench_rows(
     scale: Floats,
     limits: Floats,
     targets: Floats,
-    projected: NDArray[np.bool_],
+    projected: Bools,
 ) -> None:
     n_epm = targets.shape[1]
     size = POSE_SIZE * n_epm
     positions, moments = np.zeros((2, 3)), np.zeros((2, 3))
     wrench, target, relative = np.empty(6), np.empty(WRENCH_SIZE), np.empty(WRENCH_SIZE)
     best_pose, best_wrench = np.empty(size), np.empty(WRENCH_SIZE)
-    for i in range(len(actions)):
+    for i in range(first, last):
         for robot in range(2):
             positions[robot, 0], positions[robot, 1] = measured[i, robot, 0], measured[i, robot, 1]
             moments[robot, 0] = ipm_moment * math.cos(measured[i, robot, 2])
@@ -171,11 +195,12 @@ def _wrench_rows(
 class Actions:
     """One action mode for a system: turns actions (n, size) into commanded EPMs (n, N, 6)."""
 
-    def __init__(self, mode: ActionMode, system: System) -> None:
+    def __init__(self, mode: ActionMode, system: System, workers: Workers | None = None) -> None:
         require(mode in get_args(ActionMode), "action", "one of " + ", ".join(get_args(ActionMode)), mode)
         self.mode = mode
         self.size = 6 if mode == "wrench" else POSE_SIZE * system.n_epm
         self._system = system
+        self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
         self._home = home_pose(system.n_epm)
         self._low, self._high = pose_bounds(system)
@@ -186,12 +211,15 @@ class Actions:
 
     def home(self, measured: Floats) -> Floats:
         """Return the EPMs (n, N, 6) at home for robots measured at (n, 2, 3)."""
-        targets = np.empty((len(measured), self._system.n_epm, 6))
-        zeros = np.zeros((len(measured), len(self._home)))
-        _home_rows(zeros, measured, self._home, self._limits, targets, np.empty(len(measured), np.bool_))
-        return targets
+        epms = np.empty((len(measured), self._system.n_epm, 6))
+        self.start(np.ones(len(measured), np.bool_), measured, epms)
+        return epms
 
-    def to_epms(self, actions: Floats, measured: Floats, epms: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def start(self, mask: Bools, measured: Floats, epms: Floats) -> None:
+        """Put the EPMs (n, N, 6) at home where ``mask`` says, for robots measured at (n, 2, 3)."""
+        _start_rows(mask, measured, self._home, self._limits, epms)
+
+    def to_epms(self, actions: Floats, measured: Floats, epms: Floats) -> tuple[Floats, Bools]:
         """Return the commanded EPMs (n, N, 6) and where the least gap made them differ from the action.
 
         Parameters
@@ -203,15 +231,18 @@ class Actions:
         epms : ndarray, shape (n, N, 6)
             Present EPMs.
         """
-        targets, projected = np.empty_like(epms), np.empty(len(epms), np.bool_)
+        n, run = len(epms), self._workers.run
+        targets, projected = np.empty(epms.shape), np.empty(n, np.bool_)
         if self.mode == "home":
-            _home_rows(actions, measured, self._home, self._limits, targets, projected)
+            run(_home_rows, n, actions, measured, self._home, self._limits, targets, projected)
         elif self.mode == "pose":
-            _pose_rows(actions, self._low, self._high, self._limits, targets, projected)
+            run(_pose_rows, n, actions, self._low, self._high, self._limits, targets, projected)
         elif self.mode == "step":
-            _step_rows(actions, epms, self._limits, targets, projected)
+            run(_step_rows, n, actions, epms, self._limits, targets, projected)
         else:
-            _wrench_rows(
+            run(
+                _wrench_rows,
+                n,
                 actions,
                 measured,
                 epms,

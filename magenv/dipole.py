@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.kernels import kernel
+from magenv.kernels import kernel, law
 from magenv.params import MU_0, require
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 _K = MU_0 / (4 * math.pi)
 
 
-@kernel
+@law
 def dipole_field(mx: float, my: float, mz: float, rx: float, ry: float, rz: float) -> tuple[float, float, float]:
     """Return B (T) of the moment m (A m^2) at r = point - source (m): k (3 (m.r^) r^ - m) / |r|^3."""
     r2 = rx * rx + ry * ry + rz * rz
@@ -35,7 +35,7 @@ def dipole_field(mx: float, my: float, mz: float, rx: float, ry: float, rz: floa
     return k * (along * rx - mx), k * (along * ry - my), k * (along * rz - mz)
 
 
-@kernel
+@law
 def dipole_gradient(
     mx: float, my: float, mz: float, rx: float, ry: float, rz: float
 ) -> tuple[float, float, float, float, float, float]:

@@ -1,6 +1,7 @@
 """Planar motion of the two robots under magnetic wrench, viscous drag and contact: one step of the integrator.
 
-A robot's state is a row (x, y, heading, v_x, v_y, rate) in m, rad, m/s, rad/s.
+A robot's state is a row (x, y, heading, v_x, v_y, rate) in m, rad, m/s, rad/s. Episodes move side by side in the
+columns of ``lanes`` (see ``magenv.lanes``); the laws here are those of one lane.
 """
 
 from __future__ import annotations
@@ -11,15 +12,43 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.kernels import kernel
+from magenv.angles import sincos
+from magenv.kernels import kernel, law
+from magenv.lanes import (
+    DECAY1,
+    DECAY2,
+    EPMS,
+    GAIN1,
+    GAIN2,
+    HEADING1,
+    HEADING2,
+    MOMENT1,
+    MOMENT2,
+    RATE1,
+    RATE2,
+    TURN_DECAY1,
+    TURN_DECAY2,
+    TURN_GAIN1,
+    TURN_GAIN2,
+    VX1,
+    VX2,
+    VY1,
+    VY2,
+    X1,
+    X2,
+    Y1,
+    Y2,
+)
 from magenv.params import Plant, System
-from magenv.wrench import dipole_wrench
+from magenv.poses import EPM_SIZE
+from magenv.wrench import planar_dipole_wrench
 
 Floats = NDArray[np.float64]
 
 TOUCH = 1
 WALL = 2
 _CONTACT_TURNS = 200
+_SLIGHTLY_MORE = 1.0 + 1e-9  # more than rounding can be
 
 
 class Physics(NamedTuple):
@@ -58,28 +87,32 @@ class Physics(NamedTuple):
         )
 
 
-@kernel
-def planar_wrench(robots: Floats, epms: Floats, ipm_moment: Floats, epm_moment: float, out: Floats) -> None:
-    """Write F_x, F_y (N) and tau_z (N m) on both robots, global frame, into ``out`` (2, 3).
+@law
+def planar_wrench(
+    lanes: Floats, i: int, n_epm: int, x1: float, y1: float, heading1: float, x2: float, y2: float, heading2: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return F_x, F_y (N) and tau_z (N m) on both robots of lane ``i`` at these poses, global frame.
 
     Out-of-plane components are borne by the plane. The force between the robots is computed once and obeys Newton's
     third law exactly; the torques differ.
     """
-    x1, y1, x2, y2 = robots[0, 0], robots[0, 1], robots[1, 0], robots[1, 1]
-    m1x, m1y = ipm_moment[0] * math.cos(robots[0, 2]), ipm_moment[0] * math.sin(robots[0, 2])
-    m2x, m2y = ipm_moment[1] * math.cos(robots[1, 2]), ipm_moment[1] * math.sin(robots[1, 2])
-    _, _, tz2, fx, fy, _ = dipole_wrench(m1x, m1y, 0.0, m2x, m2y, 0.0, x2 - x1, y2 - y1, 0.0)
-    _, _, tz1, _, _, _ = dipole_wrench(m2x, m2y, 0.0, m1x, m1y, 0.0, x1 - x2, y1 - y2, 0.0)
-    f1x, f1y, f2x, f2y = -fx, -fy, fx, fy
-    for k in range(len(epms)):
-        ex, ey, ez = epms[k, 0], epms[k, 1], epms[k, 2]
-        sx, sy, sz = epm_moment * epms[k, 3], epm_moment * epms[k, 4], epm_moment * epms[k, 5]
-        _, _, tz, fx, fy, _ = dipole_wrench(sx, sy, sz, m1x, m1y, 0.0, x1 - ex, y1 - ey, -ez)
+    s, c = sincos(heading1)
+    m1x, m1y = lanes[MOMENT1, i] * c, lanes[MOMENT1, i] * s
+    s, c = sincos(heading2)
+    m2x, m2y = lanes[MOMENT2, i] * c, lanes[MOMENT2, i] * s
+    dx, dy = x2 - x1, y2 - y1
+    f2x, f2y, tz2 = planar_dipole_wrench(m1x, m1y, 0.0, m2x, m2y, dx, dy, 0.0)
+    _, _, tz1 = planar_dipole_wrench(m2x, m2y, 0.0, m1x, m1y, -dx, -dy, 0.0)
+    f1x, f1y = -f2x, -f2y
+    for k in range(n_epm):
+        e = EPMS + EPM_SIZE * k
+        ex, ey, ez = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
+        mx, my, mz = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
+        fx, fy, tz = planar_dipole_wrench(mx, my, mz, m1x, m1y, x1 - ex, y1 - ey, -ez)
         f1x, f1y, tz1 = f1x + fx, f1y + fy, tz1 + tz
-        _, _, tz, fx, fy, _ = dipole_wrench(sx, sy, sz, m2x, m2y, 0.0, x2 - ex, y2 - ey, -ez)
+        fx, fy, tz = planar_dipole_wrench(mx, my, mz, m2x, m2y, x2 - ex, y2 - ey, -ez)
         f2x, f2y, tz2 = f2x + fx, f2y + fy, tz2 + tz
-    out[0, 0], out[0, 1], out[0, 2] = f1x, f1y, tz1
-    out[1, 0], out[1, 1], out[1, 2] = f2x, f2y, tz2
+    return f1x, f1y, tz1, f2x, f2y, tz2
 
 
 @kernel
@@ -89,17 +122,20 @@ def _drag(drag: float, inertia: float, h: float) -> tuple[float, float]:
 
 
 @kernel
-def drag_factors(physics: Physics, row: int, h: float, factors: Floats) -> None:
-    """Write (decay, gain) of v(t + h) = decay v + gain F per robot and axis x, y, heading into ``factors`` (2, 3, 2).
+def constants(physics: Physics, h: float, out: Floats) -> None:
+    """Write what a substep of ``h`` (s) needs of the physics into ``out`` (n, 10), in the order of ``lanes``.
 
-    Exact for constant force F under viscous drag; the same for every substep of length ``h``.
+    Per robot decay and gain of v(t + h) = decay v + gain F, linear and turning: exact for constant force F under
+    viscous drag. Then the moments of both robots (A m^2).
     """
-    for robot in range(2):
-        linear = _drag(physics.drag_linear[row, robot], physics.mass[row, robot], h)
-        factors[robot, 0, 0], factors[robot, 0, 1] = linear
-        factors[robot, 1, 0], factors[robot, 1, 1] = linear
-        turning = _drag(physics.drag_rotational[row, robot], physics.inertia[row, robot], h)
-        factors[robot, 2, 0], factors[robot, 2, 1] = turning
+    for row in range(len(out)):
+        for robot in range(2):
+            at = 4 * robot
+            out[row, at], out[row, at + 1] = _drag(physics.drag_linear[row, robot], physics.mass[row, robot], h)
+            out[row, at + 2], out[row, at + 3] = _drag(
+                physics.drag_rotational[row, robot], physics.inertia[row, robot], h
+            )
+            out[row, 8 + robot] = physics.ipm_moment[row, robot]
 
 
 @kernel
@@ -147,22 +183,36 @@ def _keep_inside(robots: Floats, limit: float) -> int:
     return found
 
 
-@kernel
-def advance(robots: Floats, epms: Floats, physics: Physics, row: int, h: float, factors: Floats, force: Floats) -> int:
-    """Advance both robots (2, 6) by ``h`` in place; return the contact flags.
-
-    ``factors`` are those of ``drag_factors`` for ``h``, ``force`` (2, 3) is scratch.
+@law
+def advance(lanes: Floats, i: int, n_epm: int, h: float) -> None:
+    """Advance both robots of lane ``i`` by ``h`` (s), contact apart.
 
     Half a drift, a kick with drag integrated exactly, half a drift: symmetric, so of second order, with one evaluation
     of the wrench; exact for the terminal velocity however strong the drag.
     """
-    for robot in range(2):
-        for axis in range(3):
-            robots[robot, axis] += 0.5 * h * robots[robot, 3 + axis]
-    planar_wrench(robots, epms, physics.ipm_moment[row], physics.epm_moment[row], force)
-    for robot in range(2):
-        for axis in range(3):
-            decay, gain = factors[robot, axis, 0], factors[robot, axis, 1]
-            robots[robot, 3 + axis] = decay * robots[robot, 3 + axis] + gain * force[robot, axis]
-            robots[robot, axis] += 0.5 * h * robots[robot, 3 + axis]
-    return resolve_contact(robots, physics.mass[row], physics.body_diameter, physics.wall_radius)
+    half = 0.5 * h
+    vx1, vy1, rate1 = lanes[VX1, i], lanes[VY1, i], lanes[RATE1, i]
+    vx2, vy2, rate2 = lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i]
+    x1, y1, heading1 = lanes[X1, i] + half * vx1, lanes[Y1, i] + half * vy1, lanes[HEADING1, i] + half * rate1
+    x2, y2, heading2 = lanes[X2, i] + half * vx2, lanes[Y2, i] + half * vy2, lanes[HEADING2, i] + half * rate2
+    f1x, f1y, tz1, f2x, f2y, tz2 = planar_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
+    vx1 = lanes[DECAY1, i] * vx1 + lanes[GAIN1, i] * f1x
+    vy1 = lanes[DECAY1, i] * vy1 + lanes[GAIN1, i] * f1y
+    rate1 = lanes[TURN_DECAY1, i] * rate1 + lanes[TURN_GAIN1, i] * tz1
+    vx2 = lanes[DECAY2, i] * vx2 + lanes[GAIN2, i] * f2x
+    vy2 = lanes[DECAY2, i] * vy2 + lanes[GAIN2, i] * f2y
+    rate2 = lanes[TURN_DECAY2, i] * rate2 + lanes[TURN_GAIN2, i] * tz2
+    lanes[VX1, i], lanes[VY1, i], lanes[RATE1, i] = vx1, vy1, rate1
+    lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i] = vx2, vy2, rate2
+    lanes[X1, i], lanes[Y1, i], lanes[HEADING1, i] = x1 + half * vx1, y1 + half * vy1, heading1 + half * rate1
+    lanes[X2, i], lanes[Y2, i], lanes[HEADING2, i] = x2 + half * vx2, y2 + half * vy2, heading2 + half * rate2
+
+
+@law
+def may_touch(lanes: Floats, i: int, diameter: float, wall_radius: float) -> bool:
+    """Return whether ``resolve_contact`` must look at lane ``i``: where it says no, there is no contact."""
+    near, far = diameter * _SLIGHTLY_MORE, (wall_radius - 0.5 * diameter) / _SLIGHTLY_MORE
+    x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
+    dx, dy = x2 - x1, y2 - y1
+    touch = dx * dx + dy * dy < near * near
+    return touch | (x1 * x1 + y1 * y1 > far * far) | (x2 * x2 + y2 * y2 > far * far)

@@ -95,6 +95,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.layout = self._episodes.layout
         self.observation_space = self._episodes.observation_space
         self.action_space = self._episodes.action_space
+        self._drawn_from: np.random.Generator | None = None
         self._running = False
         self._renderer: Renderer | None = None
 
@@ -103,7 +104,10 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; the same seed gives the same episode, bit for bit."""
         super().reset(seed=seed)
-        self._episodes.start(0, self.np_random)
+        if self.np_random is not self._drawn_from:
+            self._drawn_from = self.np_random
+            self._episodes.seed(0, self.np_random)
+        self._episodes.start(_ACTIVE)
         self._running = True
         if self._renderer is not None:
             self._renderer.restart()

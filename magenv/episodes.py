@@ -6,22 +6,36 @@ generator before the first action, whatever the controller does.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
+from magenv.kernels import kernel
 from magenv.params import PLANTS, System, TaskParams, choose, require
-from magenv.poses import from_cartesian
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_rows
-from magenv.trajectories import check_scenario, draw
+from magenv.trajectories import (
+    draw_keys,
+    draw_rows,
+    named_trajectory,
+    random_limits,
+    reference_kernel,
+    trajectory_of,
+)
+from magenv.workers import Workers
 from magenv.world import World
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+_AHEAD = 16
+"""Episodes for which a row draws at a time, whatever the size of the batch: it is part of what a seed means."""
+_TERMS = tuple(f"reward_{name}" for name in REWARD_TERMS)
 
 
 @dataclass(frozen=True)
@@ -38,21 +52,96 @@ class Settings:
 
 
 def check_action(action: object, shape: tuple[int, ...]) -> Floats:
-    """Return an action, or a batch of them, as float64 clipped to [-1, 1].
+    """Return an action, or a batch of them, as a new array of float64 clipped to [-1, 1].
 
     Raises
     ------
     ValueError
         If it has another shape or is not finite.
     """
-    must_be = f"an array of shape {shape}"
     try:
-        numbers = np.asarray(action, dtype=np.float64)
+        numbers = np.array(action, dtype=np.float64, order="C")
     except (TypeError, ValueError):
-        raise ValueError(f"Input action must be {must_be}; instead received {action!r}.") from None
-    require(numbers.shape == shape, "action", must_be, numbers.shape)
-    require(bool(np.isfinite(numbers).all()), "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
-    return np.clip(numbers, -1.0, 1.0)
+        raise ValueError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
+    if numbers.shape != shape:
+        require(False, "action", f"an array of shape {shape}", numbers.shape)
+    if not _clip(numbers.reshape(-1)):
+        numbers = np.array(action, dtype=np.float64)
+        require(False, "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
+    return numbers
+
+
+@kernel
+def _clip(numbers: Floats) -> bool:
+    """Clip ``numbers`` (k,) to [-1, 1] in place; return whether all were finite."""
+    unfit = 0
+    for i in range(len(numbers)):
+        unfit += 0 if abs(numbers[i]) < math.inf else 1
+        numbers[i] = min(max(numbers[i], -1.0), 1.0)
+    return unfit == 0
+
+
+@kernel
+def _place_rows(
+    mask: Bools,
+    offsets: Floats,
+    used: NDArray[np.int64],
+    position_sd: float,
+    heading_sd: float,
+    coefficients: Floats,
+    duration: Floats,
+    robots: Floats,
+    measured: Floats,
+    before: Floats,
+    projected: Bools,
+) -> None:
+    """Put the robots at rest near the start of their references where ``mask`` says, by their next offsets."""
+    for i in range(len(mask)):
+        if mask[i]:
+            which = trajectory_of(i, len(duration))
+            reference_kernel(coefficients[which], duration[which], 0.0, measured[i])
+            offset = offsets[i, used[i]]
+            used[i] += 1
+            for robot in range(2):
+                measured[i, robot, 0] += position_sd * offset[2 * robot]
+                measured[i, robot, 1] += position_sd * offset[2 * robot + 1]
+                measured[i, robot, 2] += heading_sd * offset[4 + robot]
+                for j in range(3):
+                    robots[i, robot, j], robots[i, robot, 3 + j] = measured[i, robot, j], 0.0
+                    before[i, robot, j] = measured[i, robot, j]
+            projected[i] = False
+
+
+@kernel
+def _settle_rows(
+    active: Bools,
+    robots: Floats,
+    commanded: Bools,
+    counts: NDArray[np.int64],
+    terms: Floats,
+    time: Floats,
+    duration: Floats,
+    period: float,
+    measured: Floats,
+    before: Floats,
+    projected: Bools,
+    reward: Floats,
+    terminated: Bools,
+    truncated: Bools,
+) -> None:
+    """Measure the robots after a hold; write what it paid and how it ended. Inactive rows: nothing, not ended."""
+    for i in range(len(active)):
+        reward[i], terminated[i], truncated[i] = 0.0, False, False
+        if active[i]:
+            for robot in range(2):
+                for j in range(3):
+                    before[i, robot, j] = measured[i, robot, j]
+                    measured[i, robot, j] = robots[i, robot, j]
+            projected[i] = commanded[i]
+            reward[i] = 0.5 * (terms[0, i] + terms[1, i])
+            terminated[i] = counts[1, i] > 0
+            over = time[i] >= duration[trajectory_of(i, len(duration))] - 1e-9 * period
+            truncated[i] = over and not terminated[i]
 
 
 class Episodes:
@@ -68,45 +157,78 @@ class Episodes:
         The true state.
     """
 
-    def __init__(self, n: int, settings: Settings) -> None:
+    def __init__(self, n: int, settings: Settings, threads: int = 1) -> None:
         require(settings.n_epm in (2, 3) and not isinstance(settings.n_epm, bool), "n_epm", "2 or 3", settings.n_epm)
         plant = self.plant = choose(PLANTS, "plant", settings.plant)
-        check_scenario(settings.scenario)
+        trajectory = named_trajectory(settings.scenario)
         self.settings = settings
         self.system = System(n_epm=settings.n_epm)
         self.task = TaskParams(control_hz=settings.control_hz)
         self.layout = Layout(
             self.system, plant.workspace_radius_m, self.task.period_s, settings.observation, settings.frame
         )
-        self.actions = Actions(settings.action, self.system)
-        self.world = World(n, self.system, plant, self.task)
+        self._workers = Workers(threads)
+        self.actions = Actions(settings.action, self.system, self._workers)
+        self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
         bounds = self.layout.bounds()
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.actions.size,), np.float32)
         self._bounds = bounds
         self._measured: Floats = np.zeros((n, 2, 3))
         self._before: Floats = np.zeros((n, 2, 3))
-        self._terms = {name: np.zeros(n) for name in REWARD_TERMS}
+        self._terms: Floats = np.zeros((len(REWARD_TERMS), n))
         self._projected: Bools = np.zeros(n, np.bool_)
+        self._rngs: list[np.random.Generator | None] = [None] * n
+        self._used: NDArray[np.int64] = np.full(n, _AHEAD)
+        self._offsets: Floats = np.zeros((n, _AHEAD, 6))
+        self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if trajectory is None else 0), np.uint64)
 
-    def start(self, row: int, rng: np.random.Generator) -> None:
-        """Begin a new episode in ``row``, drawn from ``rng``."""
-        trajectory = draw(self.settings.scenario, rng)
-        robots = np.zeros((2, 6))
-        robots[:, :3] = trajectory.at(0.0)
-        robots[:, :2] += rng.normal(0.0, self.task.start_position_sd_m, (2, 2))
-        robots[:, 2] += rng.normal(0.0, self.task.start_heading_sd_rad, 2)
-        epms = self.actions.home(robots[None, :, :3])[0]
-        self.world.start(row, trajectory, robots, epms)
-        self._measured[row] = robots[:, :3]
-        self._before[row] = robots[:, :3]
-        self._projected[row] = False
+    def seed(self, row: int, rng: np.random.Generator) -> None:
+        """Draw the episodes of ``row`` from ``rng`` from now on."""
+        self._rngs[row] = rng
+        self._used[row] = _AHEAD
+
+    def start(self, mask: Bools) -> None:
+        """Begin a new episode in each row where ``mask`` says, drawn from the row's generator."""
+        w = self.world
+        for row in np.flatnonzero(mask & (self._used == _AHEAD)).tolist():
+            self._draw_ahead(row)
+        if self.settings.scenario == "random":
+            keys = self._keys[np.arange(len(mask)), np.minimum(self._used, _AHEAD - 1)]
+            self._workers.run(draw_rows, len(mask), mask, keys, *random_limits(), w.coefficients, w.duration_s)
+        _place_rows(
+            mask,
+            self._offsets,
+            self._used,
+            self.task.start_position_sd_m,
+            self.task.start_heading_sd_rad,
+            w.coefficients,
+            w.duration_s,
+            w.robots,
+            self._measured,
+            self._before,
+            self._projected,
+        )
+        self.actions.start(mask, self._measured, w.epms)
+        w.begin(mask)
+
+    def _draw_ahead(self, row: int) -> None:
+        """Draw what the next episodes of ``row`` need, many at a time: one draw costs as much as many."""
+        rng = self._rngs[row]
+        if rng is None:
+            rng = self._rngs[row] = seeding.np_random(None)[0]
+        if self._keys.size:
+            self._keys[row] = draw_keys(rng, _AHEAD)
+        self._offsets[row] = rng.standard_normal((_AHEAD, 6))
+        self._used[row] = 0
 
     def observe(self) -> NDArray[np.float32]:
         """Return the observations (n, d), newly allocated."""
         w = self.world
         out = np.empty((len(self._measured), self.layout.size), np.float32)
-        observe_rows(
+        self._workers.run(
+            observe_rows,
+            len(out),
             self._measured,
             self._before,
             w.coefficients,
@@ -123,33 +245,39 @@ class Episodes:
 
     def step(self, actions: Floats, active: Bools) -> tuple[Floats, Bools, Bools]:
         """Act (n, size), checked, for one control period in the active rows; return reward, terminated, truncated."""
-        w = self.world
-        targets, projected = self.actions.to_epms(actions, self._measured, w.epms)
-        measured = w.step(targets, active)
-        self._projected = np.where(active, projected, self._projected)
-        self._before[active] = self._measured[active]
-        self._measured[active] = w.robots[active, :, :3]
-        reward_rows(
-            measured.position_error_m, measured.heading_error_rad, self._terms["position"], self._terms["heading"]
+        w, n = self.world, len(active)
+        targets, commanded = self.actions.to_epms(actions, self._measured, w.epms)
+        m = w.step(targets, active)
+        reward_rows(m.position_error_m, m.heading_error_rad, self._terms)
+        reward, terminated, truncated = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)
+        _settle_rows(
+            active,
+            w.robots,
+            commanded,
+            m.counts,
+            self._terms,
+            w.time_s(),
+            w.duration_s,
+            w.period_s,
+            self._measured,
+            self._before,
+            self._projected,
+            reward,
+            terminated,
+            truncated,
         )
-        terminated = active & (measured.loss > 0)
-        truncated = active & ~terminated & w.ended()
-        reward = np.where(active, sum(self._terms.values()) / len(self._terms), 0.0)
         return reward, terminated, truncated
 
     def state_info(self) -> dict[str, NDArray[Any]]:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""
-        w = self.world
-        return {
-            "time_s": w.time_s(),
-            "robots": w.robots.copy(),
-            "reference": w.references(),
-            "epm_pose": from_cartesian(w.epms[..., :3], w.epms[..., 3:]),
-        }
+        time, references, poses = self.world.describe()
+        return {"time_s": time, "robots": self.world.robots.copy(), "reference": references, "epm_pose": poses}
 
     def step_info(self) -> dict[str, NDArray[Any]]:
         """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated."""
-        info: dict[str, NDArray[Any]] = {name: value.copy() for name, value in vars(self.world.measurements).items()}
-        info |= {f"reward_{name}": value.copy() for name, value in self._terms.items()}
+        m = self.world.measurements
+        info: dict[str, NDArray[Any]] = dict(zip(m.NUMBERS, m.numbers.copy(), strict=True))
+        info |= zip(m.COUNTS, m.counts.copy(), strict=True)
+        info |= zip(_TERMS, self._terms.copy(), strict=True)
         info["projected"] = self._projected.copy()
         return info

@@ -23,7 +23,7 @@ def _cache_dir() -> Path:
     digest = hashlib.sha256()
     for source in sorted(package.glob("*.py")):
         text = source.read_bytes()
-        if b"@kernel" in text or source.name == "params.py":  # params holds the constants
+        if b"@kernel" in text or b"@law" in text or source.name == "params.py":  # params holds the constants
             digest.update(source.name.encode() + b"\0" + text)
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or package / "__pycache__")
     if not os.access(package, os.W_OK) and "NUMBA_CACHE_DIR" not in os.environ:
@@ -34,17 +34,30 @@ def _cache_dir() -> Path:
 _CACHE_DIR = str(_cache_dir())
 
 
-def kernel(function: Function) -> Function:
-    """Compile ``function`` with numba on first use and keep the machine code on disk.
-
-    ``error_model="numpy"``: a division by zero gives infinity or NaN, as in numpy, instead of an exception. No fast
-    mathematics: NaN and infinity stay visible, and scalar and batched calls give the same bits.
-    """
+def _compile(function: Function, **options: bool) -> Function:
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = _CACHE_DIR
     try:
-        compiled: Any = numba.njit(cache=True, error_model="numpy")(function)
+        compiled: Any = numba.njit(cache=True, error_model="numpy", **options)(function)
     finally:
         config.CACHE_DIR = before
     return cast("Function", compiled)
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` with numba on first use and keep the machine code on disk.
+
+    ``error_model="numpy"``: a division by zero gives infinity or NaN, as in numpy, instead of an exception. No fast
+    mathematics, contraction of products and sums included: NaN and infinity stay visible, and scalar and batched calls
+    give the same bits. Kernels release the interpreter lock, so that threads may share a batch.
+    """
+    return _compile(function, nogil=True)
+
+
+def law(function: Function) -> Function:
+    """Compile a small kernel as ``kernel`` does, and make it part of every loop that calls it.
+
+    Only so can LLVM vectorise the loop; the law still stands once.
+    """
+    return _compile(function, nogil=True, forceinline=True)

@@ -11,13 +11,16 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.kernels import kernel
+from magenv.angles import arctan2, sincos
+from magenv.kernels import kernel, law
 from magenv.params import System, require
 
 Floats = NDArray[np.float64]
 
 POSE_SIZE = 5
 """Numbers per EPM in a pose vector."""
+EPM_SIZE = 6
+"""Numbers per EPM in Cartesian form: centre, unit moment."""
 _STUCK_TURNS = 100
 GAP_TOLERANCE_M = 1e-9
 """Within this the least gap and the radius limits hold after ``project``."""
@@ -30,26 +33,29 @@ SECOND_ROBOT_WEIGHT = 0.8
 """Share of robot 2 in the robots' frame: below one, so that the frame exists for antiparallel robots too."""
 
 
-@kernel
+@law
 def pose_to_epm(pose: Floats, epm: Floats) -> None:
     """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
-    azimuth, elevation, radius, moment_azimuth, moment_elevation = pose[0], pose[1], pose[2], pose[3], pose[4]
-    epm[0] = radius * math.cos(elevation) * math.cos(azimuth)
-    epm[1] = radius * math.cos(elevation) * math.sin(azimuth)
-    epm[2] = radius * math.sin(elevation)
-    epm[3] = math.cos(moment_elevation) * math.cos(moment_azimuth)
-    epm[4] = math.cos(moment_elevation) * math.sin(moment_azimuth)
-    epm[5] = math.sin(moment_elevation)
+    s, c = sincos(pose[0])
+    up, level = sincos(pose[1])
+    epm[0] = pose[2] * level * c
+    epm[1] = pose[2] * level * s
+    epm[2] = pose[2] * up
+    s, c = sincos(pose[3])
+    up, level = sincos(pose[4])
+    epm[3] = level * c
+    epm[4] = level * s
+    epm[5] = up
 
 
-@kernel
+@law
 def epm_to_pose(epm: Floats, pose: Floats) -> None:
     """Write the pose (5,) of ``epm`` (6,), azimuths in [-pi, pi], elevations in [-pi/2, pi/2]."""
-    pose[0] = math.atan2(epm[1], epm[0])
-    pose[1] = math.atan2(epm[2], math.hypot(epm[0], epm[1]))
+    pose[0] = arctan2(epm[1], epm[0])
+    pose[1] = arctan2(epm[2], math.sqrt(epm[0] * epm[0] + epm[1] * epm[1]))
     pose[2] = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
-    pose[3] = math.atan2(epm[4], epm[3])
-    pose[4] = math.atan2(epm[5], math.hypot(epm[3], epm[4]))
+    pose[3] = arctan2(epm[4], epm[3])
+    pose[4] = arctan2(epm[5], math.sqrt(epm[3] * epm[3] + epm[4] * epm[4]))
 
 
 @kernel
@@ -121,17 +127,25 @@ def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
     return moved
 
 
-@kernel
-def robots_frame(heading_1: float, heading_2: float) -> float:
-    """Return the heading (rad) of the frame the robots carry: along h1 + 0.8 h2.
+@law
+def frame_direction(heading_1: float, heading_2: float) -> tuple[float, float]:
+    """Return the direction (cosine, sine) of the frame the robots carry: along h1 + 0.8 h2.
 
     For parallel robots it is their mean heading. The plain mean does not exist for antiparallel ones, and no rule
     that treats both alike does; here robot 1 decides, smoothly.
     """
-    return math.atan2(
-        math.sin(heading_1) + SECOND_ROBOT_WEIGHT * math.sin(heading_2),
-        math.cos(heading_1) + SECOND_ROBOT_WEIGHT * math.cos(heading_2),
-    )
+    s1, c1 = sincos(heading_1)
+    s2, c2 = sincos(heading_2)
+    x, y = c1 + SECOND_ROBOT_WEIGHT * c2, s1 + SECOND_ROBOT_WEIGHT * s2
+    norm = math.sqrt(x * x + y * y)
+    return x / norm, y / norm
+
+
+@kernel
+def robots_frame(heading_1: float, heading_2: float) -> float:
+    """Return the heading (rad) of the frame the robots carry."""
+    c, s = frame_direction(heading_1, heading_2)
+    return arctan2(s, c)
 
 
 def home_pose(n_epm: int) -> Floats:

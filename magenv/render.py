@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magenv.params import Plant, System, require
-from magenv.trajectories import Trajectory
 from magenv.world import LOSSES, World
 
 if TYPE_CHECKING:
@@ -94,7 +93,7 @@ class Scene:
 
 def scene_of(world: World, row: int) -> Scene:
     """Return a copy of what there is to see of one episode; where control is lost, at that very instant."""
-    trajectory = Trajectory(float(world.duration_s[row]), world.coefficients[row])
+    trajectory = world.trajectory(row)
     time = float(world.time_s()[row])
     samples = np.linspace(0.0, trajectory.duration_s, PATH_SAMPLES)
     return Scene(

@@ -26,11 +26,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.kernels import kernel
+from magenv.angles import sincos, wrap
+from magenv.kernels import kernel, law
 from magenv.params import System, require
-from magenv.poses import robots_frame
-from magenv.trajectories import reference_kernel
-from magenv.world import wrap
+from magenv.poses import frame_direction
+from magenv.trajectories import reference_kernel, trajectory_of
 
 Floats = NDArray[np.float64]
 Frame = Literal["robots", "global"]
@@ -104,13 +104,13 @@ class Layout:
         return (1.001 * np.array(full[: self.size])).astype(np.float32)
 
 
-@kernel
+@law
 def _turn(x: float, y: float, c: float, s: float) -> tuple[float, float]:
     """Return the vector seen in a frame whose heading has cosine c and sine s."""
     return c * x + s * y, c * y - s * x
 
 
-@kernel
+@law
 def _observe(
     measured: Floats,
     before: Floats,
@@ -119,52 +119,46 @@ def _observe(
     period: float,
     r_max: float,
     carried: bool,
-    bounds: NDArray[np.float32],
     full: Floats,
-    out: NDArray[np.float32],
 ) -> None:
-    """Write one observation; ``references`` (5, 2, 3), ``full`` is scratch for all parts."""
-    frame = robots_frame(measured[0, 2], measured[1, 2])
-    turn = frame if carried else 0.0
-    c, s = math.cos(turn), math.sin(turn)
+    """Write all parts of one observation into ``full``; ``references`` (5, 2, 3)."""
+    frame_c, frame_s = frame_direction(measured[0, 2], measured[1, 2])
+    c, s = (frame_c, frame_s) if carried else (1.0, 0.0)
     for robot in range(2):
-        now, error, pose, rate = (
-            measured[robot],
-            full[4 * robot :],
-            full[_ROBOTS + 4 * robot :],
-            full[_RATES + 3 * robot :],
-        )
-        target = references[0, robot]
-        x, y = _turn(target[0] - now[0], target[1] - now[1], c, s)
-        error[0], error[1] = x / ERROR_SCALE_M, y / ERROR_SCALE_M
-        error[2], error[3] = math.sin(target[2] - now[2]), math.cos(target[2] - now[2])
-        x, y = _turn(now[0], now[1], c, s)
-        pose[0], pose[1] = x / LENGTH_SCALE_M, y / LENGTH_SCALE_M
-        pose[2], pose[3] = math.sin(now[2] - turn), math.cos(now[2] - turn)
-        x, y = _turn(now[0] - before[robot, 0], now[1] - before[robot, 1], c, s)
-        rate[0], rate[1] = x / period / SPEED_SCALE_MPS, y / period / SPEED_SCALE_MPS
-        rate[2] = wrap(now[2] - before[robot, 2]) / period
+        error, pose, rate = 4 * robot, _ROBOTS + 4 * robot, _RATES + 3 * robot
+        x, y, heading = measured[robot, 0], measured[robot, 1], measured[robot, 2]
+        target_x, target_y, target_heading = references[0, robot, 0], references[0, robot, 1], references[0, robot, 2]
+        along, across = _turn(target_x - x, target_y - y, c, s)
+        full[error], full[error + 1] = along / ERROR_SCALE_M, across / ERROR_SCALE_M
+        full[error + 2], full[error + 3] = sincos(target_heading - heading)
+        along, across = _turn(x, y, c, s)
+        full[pose], full[pose + 1] = along / LENGTH_SCALE_M, across / LENGTH_SCALE_M
+        sine, cosine = sincos(heading)
+        full[pose + 3], full[pose + 2] = _turn(cosine, sine, c, s)
+        along, across = _turn(x - before[robot, 0], y - before[robot, 1], c, s)
+        full[rate], full[rate + 1] = along / (period * SPEED_SCALE_MPS), across / (period * SPEED_SCALE_MPS)
+        full[rate + 2] = wrap(heading - before[robot, 2]) / period
         for k in range(1, PREVIEW):
-            ahead, preview = references[k, robot], full[_PREVIEW + 6 * (k - 1) + 3 * robot :]
-            x, y = _turn(ahead[0] - target[0], ahead[1] - target[1], c, s)
-            preview[0], preview[1] = x / PREVIEW_SCALE_M, y / PREVIEW_SCALE_M
-            preview[2] = wrap(ahead[2] - target[2])
+            at = _PREVIEW + 6 * (k - 1) + 3 * robot
+            along, across = _turn(references[k, robot, 0] - target_x, references[k, robot, 1] - target_y, c, s)
+            full[at], full[at + 1] = along / PREVIEW_SCALE_M, across / PREVIEW_SCALE_M
+            full[at + 2] = wrap(references[k, robot, 2] - target_heading)
     full[_SEPARATION] = math.hypot(measured[1, 0] - measured[0, 0], measured[1, 1] - measured[0, 1]) / LENGTH_SCALE_M
-    full[_FRAME], full[_FRAME + 1] = math.sin(frame), math.cos(frame)
+    full[_FRAME], full[_FRAME + 1] = frame_s, frame_c
     for k in range(len(epms)):
-        epm, part = epms[k], full[_EPMS + _EPM_SIZE * k :]
-        radius = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
-        part[0], part[1] = _turn(epm[0] / radius, epm[1] / radius, c, s)
-        part[2], part[3] = epm[2] / radius, radius / r_max
-        part[4], part[5] = _turn(epm[3], epm[4], c, s)
-        part[6] = epm[5]
-    for i in range(len(out)):
-        value = np.float32(full[i]) if math.isfinite(full[i]) else np.float32(0.0)
-        out[i] = min(max(value, -bounds[i]), bounds[i])
+        at = _EPMS + _EPM_SIZE * k
+        x, y, z = epms[k, 0], epms[k, 1], epms[k, 2]
+        radius = math.sqrt(x * x + y * y + z * z)
+        full[at], full[at + 1] = _turn(x / radius, y / radius, c, s)
+        full[at + 2], full[at + 3] = z / radius, radius / r_max
+        full[at + 4], full[at + 5] = _turn(epms[k, 3], epms[k, 4], c, s)
+        full[at + 6] = epms[k, 5]
 
 
 @kernel
 def observe_rows(
+    first: int,
+    last: int,
     measured: Floats,
     before: Floats,
     coefficients: Floats,
@@ -177,13 +171,17 @@ def observe_rows(
     bounds: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write the observations (n, d) of all episodes; the arguments are those of ``_observe`` and of ``World``."""
+    """Write the observations (n, d) of rows ``first`` to ``last``; the arguments are those of ``World``."""
     references = np.empty((PREVIEW, 2, 3))
     full = np.empty(_EPMS + _EPM_SIZE * epms.shape[1])
-    for i in range(len(out)):
+    for i in range(first, last):
+        which = trajectory_of(i, len(duration))
         for k in range(PREVIEW):
-            reference_kernel(coefficients[i], duration[i], (step[i] + 1 + k) * period, references[k])
-        _observe(measured[i], before[i], references, epms[i], period, r_max, carried, bounds, full, out[i])
+            reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, references[k])
+        _observe(measured[i], before[i], references, epms[i], period, r_max, carried, full)
+        for j in range(out.shape[1]):
+            value = np.float32(full[j]) if abs(full[j]) < math.inf else np.float32(0.0)
+            out[i, j] = min(max(value, -bounds[j]), bounds[j])
 
 
 def unpack(observation: ArrayLike, layout: Layout) -> Parts:
@@ -234,20 +232,17 @@ def unpack(observation: ArrayLike, layout: Layout) -> Parts:
     )
 
 
-@kernel
-def _closeness(error: float, scales: tuple[float, float, float]) -> float:
+@law
+def _closeness(error: float, near: float, middle: float, far: float) -> float:
     """Return one at zero error, falling through three scales to zero: near and far errors both have a slope."""
-    if not error < math.inf:  # NaN: the state was lost, nothing is paid
-        return 0.0
-    total = 0.0
-    for scale in scales:
-        total += 1.0 / (1.0 + (error / scale) ** 2)
-    return total / 3.0
+    a, b, c = error / near, error / middle, error / far
+    close = (1.0 / (1.0 + a * a) + 1.0 / (1.0 + b * b) + 1.0 / (1.0 + c * c)) / 3.0
+    return close if error < math.inf else 0.0  # NaN: the state was lost, nothing is paid
 
 
 @kernel
-def reward_rows(position_error: Floats, heading_error: Floats, position: Floats, heading: Floats) -> None:
-    """Write the reward terms (n,), each in [0, 1], of mean errors (n,) over the hold in m and rad."""
-    for i in range(len(position)):
-        position[i] = _closeness(position_error[i], POSITION_SCALES_M)
-        heading[i] = _closeness(heading_error[i], HEADING_SCALES_RAD)
+def reward_rows(position_error: Floats, heading_error: Floats, terms: Floats) -> None:
+    """Write the reward terms (2, n), each in [0, 1], of mean errors (n,) over the hold in m and rad."""
+    for i in range(terms.shape[1]):
+        terms[0, i] = _closeness(position_error[i], *POSITION_SCALES_M)
+        terms[1, i] = _closeness(heading_error[i], *HEADING_SCALES_RAD)

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
-from magenv.kernels import kernel
+from magenv.angles import arctan2, sincos, wrap
+from magenv.kernels import kernel, law
 from magenv.params import require
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Keys = NDArray[np.uint64]
 
 SEGMENTS = 32
 """Spline segments of every trajectory."""
@@ -34,11 +36,8 @@ RANDOM_SEPARATION_M = (0.025, 0.100)
 _RANDOM_RADIUS_M = 0.082
 _RANDOM_SPEED_MIN_MPS = 2e-4
 _RANDOM_TURN_MAX_RADPS = 0.1
-
-# Interpolation is linear in the knots: this matrix (32 segments x 4 ascending powers, 33 knots) is SciPy's spline.
-_SPLINE: Floats = (
-    CubicSpline(np.arange(SEGMENTS + 1), np.eye(SEGMENTS + 1)).c[::-1].transpose(1, 0, 2).reshape(-1, SEGMENTS + 1)
-)
+_GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +50,9 @@ class Trajectory:
     @classmethod
     def through(cls, duration_s: float, knots: Floats) -> Trajectory:
         """Return the twice continuously differentiable spline through ``knots`` (33, 2, 3), equally spaced in time."""
-        coefficients = (_SPLINE @ knots.reshape(SEGMENTS + 1, 6)).reshape(SEGMENTS, 4, 2, 3)
-        return cls(duration_s, np.ascontiguousarray(coefficients.transpose(2, 0, 3, 1)))
+        coefficients = np.empty((2, SEGMENTS, 3, 4))
+        spline_through(np.ascontiguousarray(knots), np.empty((SEGMENTS + 1, 2, 3)), coefficients)
+        return cls(duration_s, coefficients)
 
     def at(self, time_s: float) -> Floats:
         """Return x, y (m) and heading (rad, not wrapped) of both robots (2, 3), held still outside the duration."""
@@ -61,23 +61,68 @@ class Trajectory:
         return out
 
 
+@law
+def cubic(c0: float, c1: float, c2: float, c3: float, u: float) -> float:
+    """Return the value at ``u`` segments after a segment's beginning."""
+    return c0 + u * (c1 + u * (c2 + u * c3))
+
+
+@law
+def spline_position(time: float, rate: float) -> float:
+    """Return where on the spline, in segments, it is at ``time``; ``rate`` is in segments per second."""
+    return min(max(time * rate, 0.0), 1.0 * SEGMENTS)
+
+
+@law
+def trajectory_of(row: int, trajectories: int) -> int:
+    """Return which of a table of trajectories an episode follows: its own, or the only one."""
+    return min(row, trajectories - 1)
+
+
 @kernel
 def reference_kernel(coefficients: Floats, duration: float, time: float, out: Floats) -> None:
     """Write the reference (2, 3) at ``time`` (s) into ``out``."""
-    position = min(max(time / duration, 0.0), 1.0) * SEGMENTS
+    position = spline_position(time, SEGMENTS / duration)
     segment = min(int(position), SEGMENTS - 1)
     u = position - segment
     for robot in range(2):
         for axis in range(3):
             c = coefficients[robot, segment, axis]
-            out[robot, axis] = c[0] + u * (c[1] + u * (c[2] + u * c[3]))
+            out[robot, axis] = cubic(c[0], c[1], c[2], c[3], u)
 
 
 @kernel
-def reference_rows(coefficients: Floats, duration: Floats, time: Floats, out: Floats) -> None:
-    """Write the references (n, 2, 3) of n trajectories at their times (n,)."""
-    for i in range(len(out)):
-        reference_kernel(coefficients[i], duration[i], time[i], out[i])
+def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
+    """Write the coefficients (2, 32, 3, 4) of the cubic spline through ``knots`` (33, 2, 3), ends not-a-knot.
+
+    The slopes at the knots (scratch, like ``knots``) make the second derivative continuous,
+    s[k-1] + 4 s[k] + s[k+1] = 3 (y[k+1] - y[k-1]), and the third at the first and last inner knot,
+    s[0] + 2 s[1] = (-5 y[0] + 4 y[1] + y[2]) / 2 and its mirror image: a tridiagonal system without the end slopes.
+    """
+    end, pivot = SEGMENTS, np.empty(SEGMENTS)
+    for k in range(1, end):
+        pivot[k] = 2.0 if k == 1 else (2.0 if k == end - 1 else 4.0) - 1.0 / pivot[k - 1]
+    for robot in range(2):
+        for axis in range(3):
+            y, s = knots[:, robot, axis], slopes[:, robot, axis]
+            s[0] = 0.5 * (-5.0 * y[0] + 4.0 * y[1] + y[2])
+            s[end] = 0.5 * (5.0 * y[end] - 4.0 * y[end - 1] - y[end - 2])
+            for k in range(1, end):
+                right = 3.0 * (y[k + 1] - y[k - 1])
+                if k == 1:
+                    right -= s[0]
+                else:
+                    right -= s[k - 1] / pivot[k - 1]
+                s[k] = right - (s[end] if k == end - 1 else 0.0)
+            s[end - 1] /= pivot[end - 1]
+            for k in range(end - 2, 0, -1):
+                s[k] = (s[k] - s[k + 1]) / pivot[k]
+            s[0] -= 2.0 * s[1]
+            s[end] -= 2.0 * s[end - 1]
+            for k in range(end):
+                c, rise = coefficients[robot, k, axis], y[k + 1] - y[k]
+                c[0], c[1] = y[k], s[k]
+                c[2], c[3] = 3.0 * rise - 2.0 * s[k] - s[k + 1], s[k] + s[k + 1] - 2.0 * rise
 
 
 def _along_path(positions: Floats, velocities: Floats, flip_second: bool) -> Floats:
@@ -105,52 +150,8 @@ def approach(separation_m: float, anti: bool = False) -> Trajectory:
     return Trajectory.through(DURATION_S, _along_path(positions, velocities, anti))
 
 
-def random_trajectory(rng: np.random.Generator) -> Trajectory:
-    """Draw a trajectory of the training family.
-
-    The robots' midpoint travels through the workspace in a random direction on a bent path, while the line between
-    them turns slowly and its length falls to a random least separation and grows again; either robot may be on the
-    left. Headings are along the paths. Draws that leave the workspace, nearly stop or turn fast are drawn anew.
-    """
-    u = np.linspace(-1.0, 1.0, SEGMENTS + 1)
-    while True:
-        closest, widest = np.sort(rng.uniform(*RANDOM_SEPARATION_M, size=2))
-        moment = rng.uniform(-0.6, 0.6)
-        distance = closest + (widest - closest) * ((u - moment) / (1 + abs(moment))) ** 2
-        distance_rate = 2 * (widest - closest) * (u - moment) / (1 + abs(moment)) ** 2
-        bend = rng.normal(0.0, [0.010, 0.010, 0.006])
-        line = rng.normal(0.0, [0.35, 0.25, 0.25]) + np.array([rng.choice([-0.5, 0.5]) * math.pi, 0.0, 0.0])
-        half_length = rng.uniform(0.030, 0.065)
-        centre = np.stack([half_length * u, bend[0] + bend[1] * u**2 + bend[2] * u**3], axis=-1)
-        centre_rate = np.stack([np.full_like(u, half_length), 2 * bend[1] * u + 3 * bend[2] * u**2], axis=-1)
-        angle = line[0] + line[1] * u + line[2] * u**2
-        angle_rate = line[1] + 2 * line[2] * u
-        along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
-        half = 0.5 * distance[:, None] * along
-        half_rate = 0.5 * (distance_rate[:, None] * along + (distance * angle_rate)[:, None] * across)
-        direction = rng.uniform(-math.pi, math.pi)
-        turn = np.array([[math.cos(direction), math.sin(direction)], [-math.sin(direction), math.cos(direction)]])
-        positions = np.stack([centre - half, centre + half], axis=1) @ turn
-        velocities = np.stack([centre_rate - half_rate, centre_rate + half_rate], axis=1) @ turn
-        knots = _along_path(positions, velocities, flip_second=False)
-        speed = np.linalg.norm(velocities, axis=-1) * 2 / DURATION_S
-        turn_rate = np.abs(np.diff(knots[..., 2], axis=0)) * SEGMENTS / DURATION_S
-        if (
-            np.linalg.norm(positions, axis=-1).max() <= _RANDOM_RADIUS_M
-            and speed.min() >= _RANDOM_SPEED_MIN_MPS
-            and turn_rate.max() <= _RANDOM_TURN_MAX_RADPS
-        ):
-            return Trajectory.through(DURATION_S, knots)
-
-
-def check_scenario(scenario: str) -> None:
-    """Raise ``ValueError`` unless ``scenario`` names a scenario."""
-    draw(scenario, np.random.default_rng(0))
-
-
-def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
-    """Return the trajectory of a named scenario, drawing from ``rng`` for ``random`` alone.
+def named_trajectory(scenario: str) -> Trajectory | None:
+    """Return the trajectory of a named scenario; None for ``random``, of which every episode has its own.
 
     Raises
     ------
@@ -158,8 +159,121 @@ def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
         If the name is unknown.
     """
     if scenario == "random":
-        return random_trajectory(rng)
+        return None
     match = _APPROACH.fullmatch(scenario) if isinstance(scenario, str) else None
     require(match is not None and 12 <= float(match[1]) <= 100, "scenario", SCENARIO_HELP, scenario)
     assert match is not None
     return approach(float(match[1]) / 1000, anti=match[2] is not None)
+
+
+@law
+def _uniform(stream: Keys, low: float, high: float) -> float:
+    """Return a number from [low, high) of the stream (1,): SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
+    stream[0] += _GOLDEN
+    z = stream[0]
+    z = (z ^ (z >> _S30)) * _MIX_1
+    z = (z ^ (z >> _S27)) * _MIX_2
+    z = z ^ (z >> _S31)
+    return low + (high - low) * (float(z >> _S11) * 2.0**-53)
+
+
+@law
+def _normal(stream: Keys, deviation: float) -> float:
+    """Return a normally distributed number of mean zero (Box and Muller, 1958)."""
+    radius = math.sqrt(-2.0 * math.log(1.0 - _uniform(stream, 0.0, 1.0)))
+    _, cosine = sincos(_uniform(stream, 0.0, 2.0 * math.pi))
+    return deviation * radius * cosine
+
+
+@kernel
+def _try_knots(stream: Keys, duration: float, turn_max: float, knots: Floats) -> bool:
+    """Draw a candidate and write its knots (33, 2, 3); return whether it is allowed, with knots written only then.
+
+    The robots' midpoint travels through the workspace in a random direction on a bent path, while the line between
+    them turns slowly and its length falls to a random least separation and grows again; either robot may be on the
+    left. Headings are along the paths. Draws that leave the workspace, nearly stop or turn fast are not allowed.
+    """
+    a, b = _uniform(stream, *RANDOM_SEPARATION_M), _uniform(stream, *RANDOM_SEPARATION_M)
+    closest, wider = min(a, b), abs(a - b)
+    moment = _uniform(stream, -0.6, 0.6)
+    bend0, bend1, bend2 = _normal(stream, 0.010), _normal(stream, 0.010), _normal(stream, 0.006)
+    line0, line1, line2 = _normal(stream, 0.35), _normal(stream, 0.25), _normal(stream, 0.25)
+    line0 += -0.5 * math.pi if _uniform(stream, 0.0, 1.0) < 0.5 else 0.5 * math.pi
+    half_length = _uniform(stream, 0.030, 0.065)
+    turn_s, turn_c = sincos(_uniform(stream, -math.pi, math.pi))
+    for k in range(SEGMENTS + 1):
+        u = 2.0 * k / SEGMENTS - 1.0  # time from -1 to 1
+        since = (u - moment) / (1.0 + abs(moment))
+        distance, distance_rate = closest + wider * since * since, 2.0 * wider * since / (1.0 + abs(moment))
+        x, y = half_length * u, bend0 + u * u * (bend1 + u * bend2)
+        x_rate, y_rate = half_length, u * (2.0 * bend1 + 3.0 * u * bend2)
+        s, c = sincos(line0 + u * (line1 + u * line2))
+        angle_rate = line1 + 2.0 * u * line2
+        half_x, half_y = 0.5 * distance * c, 0.5 * distance * s
+        half_x_rate = 0.5 * (distance_rate * c - distance * angle_rate * s)
+        half_y_rate = 0.5 * (distance_rate * s + distance * angle_rate * c)
+        for robot in range(2):
+            side = 2.0 * robot - 1.0
+            px, py = x + side * half_x, y + side * half_y
+            vx, vy = x_rate + side * half_x_rate, y_rate + side * half_y_rate
+            if px * px + py * py > _RANDOM_RADIUS_M * _RANDOM_RADIUS_M:
+                return False
+            if math.sqrt(vx * vx + vy * vy) * 2.0 / duration < _RANDOM_SPEED_MIN_MPS:
+                return False
+            knots[k, robot, 0], knots[k, robot, 1] = turn_c * px - turn_s * py, turn_s * px + turn_c * py
+            heading = arctan2(turn_s * vx + turn_c * vy, turn_c * vx - turn_s * vy)
+            if k > 0:
+                before = knots[k - 1, robot, 2]
+                heading = before + wrap(heading - before)
+                if abs(heading - before) * SEGMENTS / duration > turn_max:
+                    return False
+            knots[k, robot, 2] = heading
+    return True
+
+
+@kernel
+def draw_rows(
+    first: int,
+    last: int,
+    mask: Bools,
+    keys: Keys,
+    duration_s: float,
+    turn_max: float,
+    coefficients: Floats,
+    duration: Floats,
+) -> None:
+    """Draw trajectories (n, 2, 32, 3, 4) and (n,) from the keys (n,) where ``mask`` says, of rows first to last."""
+    knots, slopes, stream = np.empty((SEGMENTS + 1, 2, 3)), np.empty((SEGMENTS + 1, 2, 3)), np.empty(1, np.uint64)
+    for i in range(first, last):
+        if mask[i]:
+            stream[0] = keys[i]
+            while not _try_knots(stream, duration_s, turn_max, knots):
+                pass
+            spline_through(knots, slopes, coefficients[i])
+            duration[i] = duration_s
+
+
+def random_limits() -> tuple[float, float]:
+    """Return duration (s) and greatest turn rate (rad/s) of the random family."""
+    return DURATION_S, _RANDOM_TURN_MAX_RADPS
+
+
+def draw_keys(rng: np.random.Generator, n: int) -> Keys:
+    """Return the next ``n`` keys of an episode's generator; each stands for a trajectory."""
+    return rng.integers(0, 2**64, n, dtype=np.uint64)
+
+
+def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
+    """Return the trajectory that an episode of a scenario follows, drawing from ``rng`` for ``random`` alone.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown.
+    """
+    named = named_trajectory(scenario)
+    if named is not None:
+        return named
+    coefficients, duration = np.empty((1, 2, SEGMENTS, 3, 4)), np.empty(1)
+    draw_rows(0, 1, np.ones(1, np.bool_), draw_keys(rng, 1), *random_limits(), coefficients, duration)
+    return Trajectory(float(duration[0]), coefficients[0])

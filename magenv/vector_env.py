@@ -33,6 +33,9 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         ``NextStep``: an ended episode begins anew at the next step, whose action is ignored. ``SameStep``: it begins
         anew at once; ``info["final_obs"]`` and ``info["final_info"]`` hold its end. ``Disabled``: the caller resets
         with ``options={"reset_mask": ...}``.
+    threads : int
+        Threads that share the episodes; results do not depend on it. One by default, since batches are often run side
+        by side in processes.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
@@ -49,6 +52,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         control_hz: float = 2.0,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int = 1,
     ) -> None:
         whole = isinstance(num_envs, int) and not isinstance(num_envs, bool) and num_envs >= 1
         require(whole, "num_envs", "a whole number of at least 1", num_envs)
@@ -60,13 +64,14 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self._episodes = Episodes(num_envs, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
+        settings = Settings(scenario, plant, n_epm, action, observation, frame, control_hz)
+        self._episodes = Episodes(num_envs, settings, threads)
         self.layout = self._episodes.layout
         self.single_observation_space = self._episodes.observation_space
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._begun: Bools = np.zeros(num_envs, np.bool_)
         self._ended: Bools = np.ones(num_envs, np.bool_)
         self._renderers: list[Renderer] = []
 
@@ -88,7 +93,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
             require(fits, "reset_mask", f"{self.num_envs} booleans, one of them true", options["reset_mask"])
         for row in np.flatnonzero(mask):
             if seeds[row] is not None:
-                self._rngs[row] = seeding.np_random(seeds[row])[0]
+                self._episodes.seed(int(row), seeding.np_random(seeds[row])[0])
         self._start(mask)
         return self._episodes.observe(), _masked(self._episodes.state_info(), mask)
 
@@ -102,7 +107,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         RuntimeError
             If an episode has ended and was not reset (``Disabled``), or none has begun.
         """
-        if any(rng is None for rng in self._rngs):
+        if not self._begun.all():
             raise RuntimeError("No episodes are running; call reset() before step().")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
             raise RuntimeError(
@@ -140,14 +145,12 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         )
 
     def _start(self, mask: Bools) -> None:
-        for row in np.flatnonzero(mask).tolist():
-            rng = self._rngs[row]
-            if rng is None:
-                rng = self._rngs[row] = seeding.np_random(None)[0]
-            self._episodes.start(row, rng)
-            if self._renderers:
+        self._episodes.start(mask)
+        if self._renderers:
+            for row in np.flatnonzero(mask):
                 self._renderers[row].restart()
         self._ended[mask] = False
+        self._begun |= mask
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one RGB array (h, w, 3) per episode."""

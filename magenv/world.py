@@ -6,169 +6,128 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.dynamics import TOUCH, WALL, Physics, advance, drag_factors
-from magenv.kernels import kernel
+from magenv.dynamics import Physics, constants
+from magenv.hold import LOSSES, hold_kernel
+from magenv.kernels import kernel, law
+from magenv.lanes import CONSTANTS_SIZE
 from magenv.params import Plant, System, TaskParams
-from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel, reference_rows
+from magenv.poses import POSE_SIZE, epm_to_pose
+from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel, trajectory_of
+from magenv.workers import Workers
+
+__all__ = ["LOSSES", "Measurements", "World"]
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
-LOSSES = ("none", "deviation", "touch", "wall")
-"""Kinds of loss of control by code: too far from the reference, bodies touched, wall reached."""
-_DEVIATION, _TOUCH, _WALL = 1, 2, 3
+_WIDTH = 16
+"""Lanes of a batch: several vectors, so that the processor always has independent work."""
+_FEW = 4
+"""Up to so many episodes a single lane is faster."""
 
 
-@dataclass
 class Measurements:
-    """What a world measures of one hold, from the true state; arrays of length ``n``.
+    """What a world measures of one hold, from the true state; arrays of length ``n``, views of two tables.
 
     Errors are means over both robots; without a suffix also over the substeps of the hold.
+
+    Attributes
+    ----------
+    position_error_m, heading_error_rad, position_error_end_m, heading_error_end_rad, separation_min_m
+        As named.
+    separation_tracked_m
+        Separation at the last instant of the episode at which both robots tracked; NaN where they never did.
+    substeps
+        Substeps taken in the hold: fewer than a whole hold's where control was lost.
+    loss
+        Code into ``LOSSES``.
     """
 
-    position_error_m: Floats
-    heading_error_rad: Floats
-    position_error_end_m: Floats
-    heading_error_end_rad: Floats
-    separation_min_m: Floats
-    separation_tracked_m: Floats
-    """Separation at the last instant of the episode at which both robots tracked; NaN where they never did."""
-    substeps: NDArray[np.int64]
-    """Substeps taken in the hold: fewer than a whole hold's where control was lost."""
-    loss: NDArray[np.int64]
-    """Code into ``LOSSES``."""
+    NUMBERS = (
+        "position_error_m",
+        "heading_error_rad",
+        "position_error_end_m",
+        "heading_error_end_rad",
+        "separation_min_m",
+        "separation_tracked_m",
+    )
+    COUNTS = ("substeps", "loss")
 
-    @classmethod
-    def empty(cls, n: int) -> Measurements:
-        """Return the measurements of ``n`` episodes that have not begun."""
-        return cls(
-            position_error_m=np.zeros(n),
-            heading_error_rad=np.zeros(n),
-            position_error_end_m=np.zeros(n),
-            heading_error_end_rad=np.zeros(n),
-            separation_min_m=np.full(n, np.nan),
-            separation_tracked_m=np.full(n, np.nan),
-            substeps=np.zeros(n, np.int64),
-            loss=np.zeros(n, np.int64),
-        )
+    def __init__(self, n: int) -> None:
+        self.numbers: Floats = np.zeros((len(self.NUMBERS), n))
+        self.counts: NDArray[np.int64] = np.zeros((len(self.COUNTS), n), np.int64)
+        (
+            self.position_error_m,
+            self.heading_error_rad,
+            self.position_error_end_m,
+            self.heading_error_end_rad,
+            self.separation_min_m,
+            self.separation_tracked_m,
+        ) = self.numbers
+        self.substeps, self.loss = self.counts
+        self.numbers[4:] = np.nan
 
 
 @kernel
-def wrap(angle: float) -> float:
-    """Return ``angle`` in [-pi, pi]."""
-    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
-
-
-@kernel
-def move_epms(epms: Floats, targets: Floats) -> None:
-    """Move the EPMs towards their targets for one substep. They jump, as in the paper; slower arms belong here."""
-    epms[:] = targets
-
-
-@kernel
-def _hold(
-    robots: Floats,
-    epms: Floats,
-    targets: Floats,
-    physics: Physics,
-    row: int,
-    coefficients: Floats,
-    duration: float,
-    start: float,
-    substeps: int,
-    h: float,
-    loss_distance: float,
-    tracking_distance: float,
-    tracked: float,
-) -> tuple[float, float, float, float, float, float, int, int]:
-    """Hold a command for one control period or until control is lost; return the fields of ``Measurements``."""
-    force, reference, factors = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3, 2))
-    drag_factors(physics, row, h, factors)
-    position_sum, heading_sum, nearest = 0.0, 0.0, math.inf
-    position_error, heading_error, loss, done = 0.0, 0.0, 0, 0
-    while done < substeps and loss == 0:
-        move_epms(epms, targets)
-        contact = advance(robots, epms, physics, row, h, factors, force)
-        done += 1
-        reference_kernel(coefficients, duration, start + done * h, reference)
-        first = math.hypot(robots[0, 0] - reference[0, 0], robots[0, 1] - reference[0, 1])
-        second = math.hypot(robots[1, 0] - reference[1, 0], robots[1, 1] - reference[1, 1])
-        position_error = 0.5 * (first + second)
-        heading_error = 0.5 * (abs(wrap(robots[0, 2] - reference[0, 2])) + abs(wrap(robots[1, 2] - reference[1, 2])))
-        position_sum += position_error
-        heading_sum += heading_error
-        separation = math.hypot(robots[1, 0] - robots[0, 0], robots[1, 1] - robots[0, 1])
-        nearest = min(nearest, separation)
-        farthest = max(first, second)
-        if farthest <= tracking_distance:
-            tracked = separation
-        if contact & TOUCH:
-            loss = _TOUCH
-        elif contact & WALL:
-            loss = _WALL
-        elif not farthest <= loss_distance:  # true for NaN as well
-            loss = _DEVIATION
-    return position_sum / done, heading_sum / done, position_error, heading_error, nearest, tracked, done, loss
-
-
-@kernel
-def _hold_rows(
-    active: NDArray[np.bool_],
-    robots: Floats,
-    epms: Floats,
-    targets: Floats,
-    physics: Physics,
-    coefficients: Floats,
-    duration: Floats,
-    step: NDArray[np.int64],
-    period: float,
-    substeps: int,
-    loss_distance: float,
-    tracking_distance: float,
-    position_error: Floats,
-    heading_error: Floats,
-    position_error_end: Floats,
-    heading_error_end: Floats,
-    separation_min: Floats,
-    separation_tracked: Floats,
-    substeps_done: NDArray[np.int64],
-    loss: NDArray[np.int64],
+def _begin_rows(
+    mask: Bools, robots: Floats, coefficients: Floats, duration: Floats, tracking_distance: float,
+    step: Integers, numbers: Floats, counts: Integers,
 ) -> None:
-    for i in range(len(active)):
-        if active[i]:
-            (
-                position_error[i],
-                heading_error[i],
-                position_error_end[i],
-                heading_error_end[i],
-                separation_min[i],
-                separation_tracked[i],
-                substeps_done[i],
-                loss[i],
-            ) = _hold(
-                robots[i],
-                epms[i],
-                targets[i],
-                physics,
-                i,
-                coefficients[i],
-                duration[i],
-                step[i] * period,
-                substeps,
-                period / substeps,
-                loss_distance,
-                tracking_distance,
-                separation_tracked[i],
-            )
-            step[i] += 1
+    reference = np.empty((2, 3))
+    for i in range(len(mask)):
+        if mask[i]:
+            step[i], counts[1, i] = 0, 0
+            which = trajectory_of(i, len(duration))
+            reference_kernel(coefficients[which], duration[which], 0.0, reference)
+            first = math.hypot(robots[i, 0, 0] - reference[0, 0], robots[i, 0, 1] - reference[0, 1])
+            second = math.hypot(robots[i, 1, 0] - reference[1, 0], robots[i, 1, 1] - reference[1, 1])
+            apart = math.hypot(robots[i, 1, 0] - robots[i, 0, 0], robots[i, 1, 1] - robots[i, 0, 1])
+            numbers[5, i] = apart if max(first, second) <= tracking_distance else math.nan
+
+
+@law
+def time_of(step: int, substeps_done: int, loss: int, period: float, substeps: int) -> float:
+    """Return the time (s) of a row: the control instant, or the substep at which control was lost."""
+    if loss > 0:
+        return (step - 1) * period + substeps_done * (period / substeps)
+    return step * period
+
+
+@kernel
+def _time_rows(step: Integers, counts: Integers, period: float, substeps: int, out: Floats) -> None:
+    for i in range(len(out)):
+        out[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
+
+
+@kernel
+def _reference_rows(
+    first: int, last: int, coefficients: Floats, duration: Floats, time: Floats, epms: Floats, references: Floats, poses: Floats
+) -> None:
+    for i in range(first, last):
+        which = trajectory_of(i, len(duration))
+        reference_kernel(coefficients[which], duration[which], time[i], references[i])
+        for k in range(epms.shape[1]):
+            epm_to_pose(epms[i, k], poses[i, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
 
 
 class World:
     """The state of ``n`` episodes and the one law by which it moves.
+
+    Parameters
+    ----------
+    n : int
+        Number of episodes.
+    system, plant, task
+        Their parameters.
+    trajectory : Trajectory, optional
+        The one that all episodes follow; without, each has its own.
+    workers : Workers, optional
+        Threads to share the episodes; without, the calling one.
 
     Attributes
     ----------
@@ -178,79 +137,108 @@ class World:
         Centres (m) and unit moments of the EPMs.
     step_count : ndarray, shape (n,)
         Control periods since the start.
+    coefficients, duration_s : ndarray, shape (n or 1, 2, 32, 3, 4) and (n or 1,)
+        The trajectories; one where all rows follow the same.
     """
 
-    def __init__(self, n: int, system: System, plant: Plant, task: TaskParams) -> None:
+    def __init__(
+        self,
+        n: int,
+        system: System,
+        plant: Plant,
+        task: TaskParams,
+        trajectory: Trajectory | None = None,
+        workers: Workers | None = None,
+    ) -> None:
         self.physics = Physics.of(system, plant, n)
         self.period_s = task.period_s
         # As many equal substeps as fit, none longer than the plant's.
         self.substeps = max(1, math.ceil(task.period_s / plant.substep_s - 1e-9))
         self._loss_distance = task.loss_distance_m
         self._tracking_distance = task.tracking_distance_m
+        self._workers = workers or Workers()
+        self._hold = hold_kernel(system.n_epm, 1 if n <= _FEW else _WIDTH)
+        self._constants: Floats = np.empty((n, CONSTANTS_SIZE))
+        constants(self.physics, task.period_s / self.substeps, self._constants)
         self.robots: Floats = np.zeros((n, 2, 6))
         self.epms: Floats = np.zeros((n, system.n_epm, 6))
-        self.coefficients: Floats = np.zeros((n, 2, SEGMENTS, 3, 4))
-        self.duration_s: Floats = np.ones(n)
-        self.step_count: NDArray[np.int64] = np.zeros(n, np.int64)
-        self.measurements = Measurements.empty(n)
+        own = n if trajectory is None else 1
+        self.coefficients: Floats = np.zeros((own, 2, SEGMENTS, 3, 4))
+        self.duration_s: Floats = np.ones(own)
+        if trajectory is not None:
+            self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
+        self.step_count: Integers = np.zeros(n, np.int64)
+        self.measurements = Measurements(n)
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:
-        """Begin an episode in ``row`` with the given states (2, 6) and EPMs (N, 6)."""
+        """Begin an episode in ``row``, which has a trajectory of its own, with given states (2, 6) and EPMs (N, 6)."""
         self.robots[row] = robots
         self.epms[row] = epms
         self.coefficients[row] = trajectory.coefficients
         self.duration_s[row] = trajectory.duration_s
-        self.step_count[row] = 0
-        self.measurements.loss[row] = 0
-        away = np.hypot(*(robots[:, :2] - trajectory.at(0.0)[:, :2]).T)
-        apart = float(np.hypot(*(robots[1, :2] - robots[0, :2])))
-        self.measurements.separation_tracked_m[row] = apart if away.max() <= self._tracking_distance else np.nan
+        self.begin(np.arange(len(self.robots)) == row)
 
-    def step(self, targets: Floats, active: NDArray[np.bool_]) -> Measurements:
+    def begin(self, mask: Bools) -> None:
+        """Begin episodes where ``mask`` says, with the states, EPMs and trajectories that the rows hold."""
+        m = self.measurements
+        _begin_rows(
+            mask,
+            self.robots,
+            self.coefficients,
+            self.duration_s,
+            self._tracking_distance,
+            self.step_count,
+            m.numbers,
+            m.counts,
+        )
+
+    def trajectory(self, row: int) -> Trajectory:
+        """Return the trajectory that a row follows."""
+        which = min(row, len(self.duration_s) - 1)
+        return Trajectory(float(self.duration_s[which]), self.coefficients[which])
+
+    def step(self, targets: Floats, active: Bools) -> Measurements:
         """Hold the commanded EPMs (n, N, 6) for one control period in every active row.
 
         Where control is lost, the row stops at that substep. Returns the world's own ``measurements``, overwritten at
         the next step.
         """
-        m = self.measurements
-        _hold_rows(
+        m, physics = self.measurements, self.physics
+        self._workers.run(
+            self._hold,
+            len(self.robots),
             active,
             self.robots,
             self.epms,
             targets,
-            self.physics,
+            self._constants,
+            physics.mass,
+            physics.epm_moment,
             self.coefficients,
             self.duration_s,
             self.step_count,
+            m.numbers,
+            m.counts,
             self.period_s,
             self.substeps,
             self._loss_distance,
             self._tracking_distance,
-            m.position_error_m,
-            m.heading_error_rad,
-            m.position_error_end_m,
-            m.heading_error_end_rad,
-            m.separation_min_m,
-            m.separation_tracked_m,
-            m.substeps,
-            m.loss,
+            physics.body_diameter,
+            physics.wall_radius,
         )
         return m
 
     def time_s(self) -> Floats:
         """Return the time (n,) in s: the control instant, or the substep at which control was lost."""
-        m = self.measurements
-        instant = self.step_count.astype(np.float64) * self.period_s
-        lost = (self.step_count - 1) * self.period_s + m.substeps * (self.period_s / self.substeps)
-        return np.where(m.loss > 0, lost, instant)
-
-    def references(self) -> Floats:
-        """Return the references (n, 2, 3) at the current control instants: x, y (m), heading (rad)."""
-        out = np.empty((len(self.robots), 2, 3))
-        reference_rows(self.coefficients, self.duration_s, self.time_s(), out)
+        out = np.empty(len(self.robots))
+        _time_rows(self.step_count, self.measurements.counts, self.period_s, self.substeps, out)
         return out
 
-    def ended(self) -> NDArray[np.bool_]:
-        """Return where the reference has come to its end."""
-        ended: NDArray[np.bool_] = self.time_s() >= self.duration_s - 1e-9 * self.period_s
-        return ended
+    def describe(self) -> tuple[Floats, Floats, Floats]:
+        """Return times (n,), references (n, 2, 3) at these times and the EPMs' pose vectors (n, 5 N)."""
+        n, n_epm = self.epms.shape[:2]
+        time, references, poses = self.time_s(), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
+        self._workers.run(
+            _reference_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses
+        )
+        return time, references, poses

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magenv.dipole import dipole_field, dipole_force_gradient, dipole_gradient
-from magenv.kernels import kernel
+from magenv.kernels import kernel, law
 from magenv.params import require
 from magenv.poses import POSE_SIZE, pose_to_epm
 
@@ -40,6 +40,16 @@ def dipole_wrench(
         xy * mx + yy * my + yz * mz,
         xz * mx + yz * my + zz * mz,
     )
+
+
+@law
+def planar_dipole_wrench(
+    sx: float, sy: float, sz: float, mx: float, my: float, rx: float, ry: float, rz: float
+) -> tuple[float, float, float]:
+    """Return F_x, F_y (N) and tau_z (N m) of ``dipole_wrench`` for a moment m in the plane: no more is computed."""
+    bx, by, _ = dipole_field(sx, sy, sz, rx, ry, rz)
+    xx, xy, _, yy, _, _ = dipole_gradient(sx, sy, sz, rx, ry, rz)
+    return xx * mx + xy * my, xy * mx + yy * my, mx * by - my * bx
 
 
 @kernel

@@ -1,0 +1,228 @@
+"""One control period of many episodes: command -> EPM motion -> substeps -> state and measurements.
+
+This is the loop in which the time goes. Its laws are those of ``dynamics`` and ``trajectories``.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.angles import wrap
+from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
+from magenv.kernels import kernel, law
+from magenv.lanes import (
+    COEFFICIENTS,
+    CONSTANTS,
+    CONSTANTS_SIZE,
+    CONTACT,
+    DONE,
+    EPMS,
+    HEADING1,
+    HEADING2,
+    HEADING_END,
+    HEADING_ERROR,
+    MEASURED,
+    MEASURED_SIZE,
+    POSITION_END,
+    POSITION_ERROR,
+    PROGRESS,
+    SEGMENT,
+    SEGMENT_RATE,
+    SEPARATION_MIN,
+    SEPARATION_TRACKED,
+    START,
+    STATE_SIZE,
+    X1,
+    X2,
+    Y1,
+    Y2,
+    fields,
+)
+from magenv.poses import EPM_SIZE
+from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LOSSES = ("none", "deviation", "touch", "wall")
+"""Kinds of loss of control by code: too far from the reference, bodies touched, wall reached."""
+_DEVIATION, _TOUCH, _WALL = 1, 2, 3
+
+
+@law
+def _load_segment(lanes: Floats, i: int, position: float, coefficients: Floats) -> None:
+    """Put the coefficients (2, 32, 3, 4) of the segment at ``position`` into lane ``i``."""
+    segment = min(int(position), SEGMENTS - 1) if position >= 0.0 else 0
+    lanes[SEGMENT, i] = segment
+    for j in range(24):
+        lanes[COEFFICIENTS + j, i] = coefficients[j // 12, segment, (j // 4) % 3, j % 4]
+
+
+@law
+def _reference(lanes: Floats, i: int, j: int) -> float:
+    """Return the ``j``-th coordinate of the reference: x, y, heading of robot 1, then of robot 2."""
+    c = COEFFICIENTS + 4 * j
+    return cubic(lanes[c, i], lanes[c + 1, i], lanes[c + 2, i], lanes[c + 3, i], lanes[PROGRESS, i])
+
+
+@law
+def _count(lanes: Floats, i: int, h: float) -> bool:
+    """Count the substep and place it on the reference; return whether the reference's segment has ended."""
+    done = lanes[DONE, i] + 1.0
+    progress = spline_position(lanes[START, i] + done * h, lanes[SEGMENT_RATE, i]) - lanes[SEGMENT, i]
+    lanes[DONE, i], lanes[PROGRESS, i] = done, progress
+    return progress > 1.0
+
+
+@law
+def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, tracking_distance: float) -> bool:
+    """Add lane ``i`` at a substep's end to its measurements; return whether its hold is over."""
+    x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
+    dx, dy = x1 - _reference(lanes, i, 0), y1 - _reference(lanes, i, 1)
+    first = math.sqrt(dx * dx + dy * dy)
+    dx, dy = x2 - _reference(lanes, i, 3), y2 - _reference(lanes, i, 4)
+    second = math.sqrt(dx * dx + dy * dy)
+    position_error = 0.5 * (first + second)
+    turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, 2)))
+    turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, 5)))
+    heading_error = 0.5 * (turned1 + turned2)
+    separation = math.sqrt((x2 - x1) * (x2 - x1) + (y2 - y1) * (y2 - y1))
+    lanes[POSITION_ERROR, i] += position_error
+    lanes[HEADING_ERROR, i] += heading_error
+    lanes[POSITION_END, i] = position_error
+    lanes[HEADING_END, i] = heading_error
+    lanes[SEPARATION_MIN, i] = min(lanes[SEPARATION_MIN, i], separation)
+    tracks = (first <= tracking_distance) & (second <= tracking_distance)
+    lanes[SEPARATION_TRACKED, i] = separation if tracks else lanes[SEPARATION_TRACKED, i]
+    near = (first <= loss_distance) & (second <= loss_distance)  # false for NaN as well
+    return (not near) | (lanes[CONTACT, i] > 0.0) | (lanes[DONE, i] == substeps)
+
+
+@law
+def _touch(lanes: Floats, i: int, bodies: Floats, mass: Floats, diameter: float, wall_radius: float) -> None:
+    """Resolve contact in lane ``i``; ``bodies`` (2, 6) is scratch."""
+    for j in range(2 * STATE_SIZE):
+        bodies[j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
+    lanes[CONTACT, i] = resolve_contact(bodies, mass, diameter, wall_radius)
+    for j in range(2 * STATE_SIZE):
+        lanes[X1 + j, i] = bodies[j // STATE_SIZE, j % STATE_SIZE]
+
+
+@law
+def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
+    contact = int(lanes[CONTACT, i])
+    if contact & TOUCH:
+        return _TOUCH
+    if contact & WALL:
+        return _WALL
+    dx1, dy1 = lanes[X1, i] - _reference(lanes, i, 0), lanes[Y1, i] - _reference(lanes, i, 1)
+    dx2, dy2 = lanes[X2, i] - _reference(lanes, i, 3), lanes[Y2, i] - _reference(lanes, i, 4)
+    first, second = math.sqrt(dx1 * dx1 + dy1 * dy1), math.sqrt(dx2 * dx2 + dy2 * dy2)
+    return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
+
+
+@functools.cache
+def hold_kernel(n_epm: int, width: int) -> Callable[..., None]:
+    """Return the kernel that holds commands for one control period or until control is lost, ``width`` rows at a time.
+
+    Number of EPMs and width are constants of the machine code: so the magnets are unrolled and the lanes vectorised.
+    A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
+    compute on, unseen.
+    """
+    n_fields = fields(n_epm)
+
+    def hold_rows(
+        first: int,
+        last: int,
+        active: Bools,
+        robots: Floats,
+        epms: Floats,
+        targets: Floats,
+        constants: Floats,
+        mass: Floats,
+        epm_moment: Floats,
+        coefficients: Floats,
+        duration: Floats,
+        step: NDArray[np.int64],
+        numbers: Floats,
+        counts: NDArray[np.int64],
+        period: float,
+        substeps: int,
+        loss_distance: float,
+        tracking_distance: float,
+        diameter: float,
+        wall_radius: float,
+    ) -> None:
+        lanes, bodies = np.zeros((n_fields, width)), np.empty((2, STATE_SIZE))
+        rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
+        h, upcoming, busy, idle = period / substeps, first, 0, True
+        while True:
+            if idle:  # load rows into the lanes that have none
+                idle = False
+                for i in range(width):
+                    while rows[i] < 0 and upcoming < last:
+                        row = upcoming
+                        upcoming += 1
+                        if not active[row]:
+                            continue
+                        rows[i] = row
+                        busy += 1
+                        for j in range(2 * STATE_SIZE):
+                            lanes[X1 + j, i] = robots[row, j // STATE_SIZE, j % STATE_SIZE]
+                        for j in range(CONSTANTS_SIZE):
+                            lanes[CONSTANTS + j, i] = constants[row, j]
+                        # The EPMs jump, as in the paper. Slower ones would travel in the loop over substeps, before
+                        # ``advance``, their state in the lane.
+                        for k in range(n_epm):
+                            for j in range(EPM_SIZE):
+                                epms[row, k, j] = targets[row, k, j]
+                                unit = epm_moment[row] if j >= 3 else 1.0
+                                lanes[EPMS + EPM_SIZE * k + j, i] = unit * targets[row, k, j]
+                        which = trajectory_of(row, len(duration))
+                        lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
+                        lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
+                        position = spline_position(lanes[START, i], lanes[SEGMENT_RATE, i])
+                        _load_segment(lanes, i, position, coefficients[which])
+                        lanes[POSITION_ERROR, i], lanes[HEADING_ERROR, i] = 0.0, 0.0
+                        lanes[SEPARATION_MIN, i] = math.inf
+                        lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row]
+                if busy == 0:
+                    return
+            rare = False
+            for i in range(width):
+                advance(lanes, i, n_epm, h)
+                flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
+                rare |= flagged[i]
+            if rare:
+                for i in range(width):
+                    if flagged[i]:
+                        _touch(lanes, i, bodies, mass[rows[i]], diameter, wall_radius)
+                        if lanes[PROGRESS, i] > 1.0:
+                            position = lanes[SEGMENT, i] + lanes[PROGRESS, i]
+                            _load_segment(lanes, i, position, coefficients[trajectory_of(rows[i], len(duration))])
+                            lanes[PROGRESS, i] = position - lanes[SEGMENT, i]
+            over = False
+            for i in range(width):
+                flagged[i] = (rows[i] >= 0) & _measure(lanes, i, 1.0 * substeps, loss_distance, tracking_distance)
+                over |= flagged[i]
+            if over:
+                for i in range(width):
+                    row = rows[i]
+                    if flagged[i]:
+                        for j in range(2 * STATE_SIZE):
+                            robots[row, j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
+                        for j in range(MEASURED_SIZE):
+                            numbers[j, row] = lanes[MEASURED + j, i]
+                        numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
+                        numbers[HEADING_ERROR - MEASURED, row] /= lanes[DONE, i]
+                        counts[0, row], counts[1, row] = int(lanes[DONE, i]), _loss(lanes, i, loss_distance)
+                        step[row] += 1
+                        rows[i], idle = -1, True
+                        busy -= 1
+
+    return kernel(hold_rows)

@@ -1,0 +1,42 @@
+"""Layout of the array in which episodes move side by side: ``lanes`` (fields, width), one episode a column.
+
+All quantities of all lanes stand in one array of fixed width, so that LLVM sees that they do not overlap and
+vectorises the loops over lanes. Every field is named here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from magenv.poses import EPM_SIZE
+
+STATE_SIZE = 6
+"""Numbers of a robot's state: x, y, heading, v_x, v_y, rate."""
+X1, Y1, HEADING1, VX1, VY1, RATE1 = range(6)
+X2, Y2, HEADING2, VX2, VY2, RATE2 = range(6, 12)
+
+# Constants of an episode, in the order of ``dynamics.constants``: (decay, gain) of translation and rotation, moments.
+CONSTANTS = 12
+DECAY1, GAIN1, TURN_DECAY1, TURN_GAIN1 = range(12, 16)
+DECAY2, GAIN2, TURN_DECAY2, TURN_GAIN2 = range(16, 20)
+MOMENT1, MOMENT2 = 20, 21
+CONSTANTS_SIZE = 10
+
+# The hold: its beginning (s), substeps done, contact flags found.
+START, DONE, CONTACT = 22, 23, 24
+
+# The reference: segments per second, present segment, position in it, its coefficients (2 robots, 3 axes, 4 powers).
+SEGMENT_RATE, SEGMENT, PROGRESS = 25, 26, 27
+COEFFICIENTS = 28
+COEFFICIENTS_SIZE = 24
+
+# What is measured, in the order of ``world.Measurements.numbers``; the first two are sums until the hold ends.
+MEASURED = 52
+POSITION_ERROR, HEADING_ERROR, POSITION_END, HEADING_END, SEPARATION_MIN, SEPARATION_TRACKED = range(52, 58)
+MEASURED_SIZE = 6
+
+EPMS = 58
+"""First field of the EPMs: centre (m) and moment (A m^2) of each."""
+
+
+def fields(n_epm: int) -> int:
+    """Return the number of fields."""
+    return EPMS + EPM_SIZE * n_epm
