@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.allocation import best_of, component_scales
+from magenv.angles import sincos, sincos_all
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 from magenv.poses import (
@@ -25,9 +26,11 @@ from magenv.poses import (
     frame_direction,
     home_pose,
     pose_bounds,
+    place_epm,
     pose_to_epm,
     project_epms,
     robots_frame,
+    to_cartesian,
 )
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
@@ -45,32 +48,26 @@ STEP_RADIUS_M = 0.05
 WRENCH_FORCE_N = 0.020
 WRENCH_TORQUE_NM = 0.001
 
+_BLOCK = 64  # rows whose angles are vectorised together
 _FALLBACK_STARTS = 4
 _TOLERANCE = 1e-6
 _MAX_ITERATIONS = 60
 
 
 @law
-def _home_epms(action: Floats, c: float, s: float, home: Floats, r_min: float, pose: Floats, epms: Floats) -> None:
-    """Write the EPMs (N, 6) offset by ``action`` (5 N) from ``home`` in the robots' frame of direction (c, s)."""
+def _turn(epms: Floats, c: float, s: float) -> None:
+    """Turn EPMs (N, 6) about the vertical by the angle with cosine c and sine s."""
     for k in range(len(epms)):
-        for i in range(POSE_SIZE):
-            a = action[POSE_SIZE * k + i]
-            pose[i] = home[POSE_SIZE * k + i]
-            if i == 2:
-                pose[i] += a * (HOME_RADIUS_OUT_M if a > 0.0 else HOME_RADIUS_M - r_min)
-            else:
-                pose[i] += HOME_ANGLE_RAD * a
-        epm = epms[k]
-        pose_to_epm(pose, epm)
-        epm[0], epm[1] = c * epm[0] - s * epm[1], s * epm[0] + c * epm[1]
-        epm[3], epm[4] = c * epm[3] - s * epm[4], s * epm[3] + c * epm[4]
+        e = epms[k]
+        e[0], e[1] = c * e[0] - s * e[1], s * e[0] + c * e[1]
+        e[3], e[4] = c * e[3] - s * e[4], s * e[3] + c * e[4]
 
 
 @kernel
 def _home_rows(
     first: int,
     last: int,
+    active: Bools,
     actions: Floats,
     measured: Floats,
     home: Floats,
@@ -78,29 +75,57 @@ def _home_rows(
     targets: Floats,
     projected: Bools,
 ) -> None:
-    pose = np.empty(POSE_SIZE)
-    for i in range(first, last):
-        c, s = frame_direction(measured[i, 0, 2], measured[i, 1, 2])
-        _home_epms(actions[i], c, s, home, limits[0], pose, targets[i])
-        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+    n_epm = targets.shape[1]
+    each = 2 + 4 * n_epm  # angles of a row: both headings, four of each EPM
+    angles, s, c = np.empty(_BLOCK * each), np.empty(_BLOCK * each), np.empty(_BLOCK * each)
+    for start in range(first, last, _BLOCK):
+        end, count = min(start + _BLOCK, last), 0
+        for i in range(start, end):
+            if active[i]:
+                angles[count], angles[count + 1] = measured[i, 0, 2], measured[i, 1, 2]
+                count += 2
+                for at in range(0, POSE_SIZE * n_epm, POSE_SIZE):
+                    for j in (0, 1, 3, 4):
+                        angles[count] = home[at + j] + HOME_ANGLE_RAD * actions[i, at + j]
+                        count += 1
+        sincos_all(angles, count, s, c)
+        at = 0
+        for i in range(start, end):
+            if active[i]:
+                frame_c, frame_s = frame_direction(s[at], c[at], s[at + 1], c[at + 1])
+                at += 2
+                for k in range(n_epm):
+                    a = actions[i, POSE_SIZE * k + 2]
+                    radius = home[POSE_SIZE * k + 2] + a * (HOME_RADIUS_OUT_M if a > 0.0 else HOME_RADIUS_M - limits[0])
+                    epm = targets[i, k]
+                    place_epm(
+                        radius, s[at], c[at], s[at + 1], c[at + 1], s[at + 2], c[at + 2], s[at + 3], c[at + 3], epm
+                    )
+                    at += 4
+                _turn(targets[i], frame_c, frame_s)
+                projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
 
 
 @kernel
-def _start_rows(mask: Bools, measured: Floats, home: Floats, limits: Floats, epms: Floats) -> None:
-    pose, still = np.empty(POSE_SIZE), np.zeros(len(home))
+def _start_rows(mask: Bools, measured: Floats, home_epms: Floats, limits: Floats, epms: Floats) -> None:
     for i in range(len(mask)):
         if mask[i]:
-            c, s = frame_direction(measured[i, 0, 2], measured[i, 1, 2])
-            _home_epms(still, c, s, home, limits[0], pose, epms[i])
+            s1, c1 = sincos(measured[i, 0, 2])
+            s2, c2 = sincos(measured[i, 1, 2])
+            frame_c, frame_s = frame_direction(s1, c1, s2, c2)
+            epms[i] = home_epms
+            _turn(epms[i], frame_c, frame_s)
             project_epms(epms[i], limits[0], limits[1], limits[2])
 
 
 @kernel
 def _pose_rows(
-    first: int, last: int, actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: Bools
+    first: int, last: int, active: Bools, actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: Bools
 ) -> None:
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
+        if not active[i]:
+            continue
         for k in range(targets.shape[1]):
             for j in range(POSE_SIZE):
                 at = POSE_SIZE * k + j
@@ -110,9 +135,11 @@ def _pose_rows(
 
 
 @kernel
-def _step_rows(first: int, last: int, actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: Bools) -> None:
+def _step_rows(first: int, last: int, active: Bools, actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: Bools) -> None:
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
+        if not active[i]:
+            continue
         for k in range(targets.shape[1]):
             epm_to_pose(epms[i, k], pose)
             for j in range(POSE_SIZE):
@@ -137,6 +164,7 @@ def planar_target(wrench: Floats, heading_1: float, heading_2: float, target: Fl
 def _wrench_rows(
     first: int,
     last: int,
+    active: Bools,
     actions: Floats,
     measured: Floats,
     epms: Floats,
@@ -154,6 +182,8 @@ def _wrench_rows(
     wrench, target, relative = np.empty(6), np.empty(WRENCH_SIZE), np.empty(WRENCH_SIZE)
     best_pose, best_wrench = np.empty(size), np.empty(WRENCH_SIZE)
     for i in range(first, last):
+        if not active[i]:
+            continue
         for robot in range(2):
             positions[robot, 0], positions[robot, 1] = measured[i, robot, 0], measured[i, robot, 1]
             moments[robot, 0] = ipm_moment * math.cos(measured[i, robot, 2])
@@ -203,6 +233,7 @@ class Actions:
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
         self._home = home_pose(system.n_epm)
+        self._home_epms = np.concatenate(to_cartesian(self._home), axis=-1)
         self._low, self._high = pose_bounds(system)
         # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))
@@ -217,9 +248,11 @@ class Actions:
 
     def start(self, mask: Bools, measured: Floats, epms: Floats) -> None:
         """Put the EPMs (n, N, 6) at home where ``mask`` says, for robots measured at (n, 2, 3)."""
-        _start_rows(mask, measured, self._home, self._limits, epms)
+        _start_rows(mask, measured, self._home_epms, self._limits, epms)
 
-    def to_epms(self, actions: Floats, measured: Floats, epms: Floats) -> tuple[Floats, Bools]:
+    def to_epms(
+        self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None
+    ) -> tuple[Floats, Bools]:
         """Return the commanded EPMs (n, N, 6) and where the least gap made them differ from the action.
 
         Parameters
@@ -230,19 +263,23 @@ class Actions:
             Measured x, y (m) and heading (rad) of the robots.
         epms : ndarray, shape (n, N, 6)
             Present EPMs.
+        active : ndarray, shape (n,), optional
+            Where a command is wanted; elsewhere the answer is undefined.
         """
+        active = np.ones(len(epms), np.bool_) if active is None else active
         n, run = len(epms), self._workers.run
         targets, projected = np.empty(epms.shape), np.empty(n, np.bool_)
         if self.mode == "home":
-            run(_home_rows, n, actions, measured, self._home, self._limits, targets, projected)
+            run(_home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
         elif self.mode == "pose":
-            run(_pose_rows, n, actions, self._low, self._high, self._limits, targets, projected)
+            run(_pose_rows, n, active, actions, self._low, self._high, self._limits, targets, projected)
         elif self.mode == "step":
-            run(_step_rows, n, actions, epms, self._limits, targets, projected)
+            run(_step_rows, n, active, actions, epms, self._limits, targets, projected)
         else:
             run(
                 _wrench_rows,
                 n,
+                active,
                 actions,
                 measured,
                 epms,

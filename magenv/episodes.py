@@ -33,7 +33,7 @@ from magenv.world import World
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_AHEAD = 16
+_AHEAD = 32
 """Episodes for which a row draws at a time, whatever the size of the batch: it is part of what a seed means."""
 _TERMS = tuple(f"reward_{name}" for name in REWARD_TERMS)
 
@@ -246,7 +246,7 @@ class Episodes:
     def step(self, actions: Floats, active: Bools) -> tuple[Floats, Bools, Bools]:
         """Act (n, size), checked, for one control period in the active rows; return reward, terminated, truncated."""
         w, n = self.world, len(active)
-        targets, commanded = self.actions.to_epms(actions, self._measured, w.epms)
+        targets, commanded = self.actions.to_epms(actions, self._measured, w.epms, active)
         m = w.step(targets, active)
         reward_rows(m.position_error_m, m.heading_error_rad, self._terms)
         reward, terminated, truncated = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.angles import arctan2, sincos
+from magenv.angles import arctan2, arctan2_all, sincos
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 
@@ -21,6 +21,7 @@ POSE_SIZE = 5
 """Numbers per EPM in a pose vector."""
 EPM_SIZE = 6
 """Numbers per EPM in Cartesian form: centre, unit moment."""
+_BLOCK = 64
 _STUCK_TURNS = 100
 GAP_TOLERANCE_M = 1e-9
 """Within this the least gap and the radius limits hold after ``project``."""
@@ -34,21 +35,28 @@ SECOND_ROBOT_WEIGHT = 0.8
 
 
 @law
-def pose_to_epm(pose: Floats, epm: Floats) -> None:
-    """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
-    s, c = sincos(pose[0])
-    up, level = sincos(pose[1])
-    epm[0] = pose[2] * level * c
-    epm[1] = pose[2] * level * s
-    epm[2] = pose[2] * up
-    s, c = sincos(pose[3])
-    up, level = sincos(pose[4])
-    epm[3] = level * c
-    epm[4] = level * s
-    epm[5] = up
+def place_epm(
+    radius: float, sa: float, ca: float, se: float, ce: float, sb: float, cb: float, sf: float, cf: float, epm: Floats
+) -> None:
+    """Write centre and unit moment into ``epm`` (6,).
+
+    Radius in m; sine and cosine of the centre's azimuth a and elevation e and of the moment's, b and f.
+    """
+    epm[0], epm[1], epm[2] = radius * ce * ca, radius * ce * sa, radius * se
+    epm[3], epm[4], epm[5] = cf * cb, cf * sb, sf
 
 
 @law
+def pose_to_epm(pose: Floats, epm: Floats) -> None:
+    """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
+    sa, ca = sincos(pose[0])
+    se, ce = sincos(pose[1])
+    sb, cb = sincos(pose[3])
+    sf, cf = sincos(pose[4])
+    place_epm(pose[2], sa, ca, se, ce, sb, cb, sf, cf, epm)
+
+
+@kernel
 def epm_to_pose(epm: Floats, pose: Floats) -> None:
     """Write the pose (5,) of ``epm`` (6,), azimuths in [-pi, pi], elevations in [-pi/2, pi/2]."""
     pose[0] = arctan2(epm[1], epm[0])
@@ -128,14 +136,12 @@ def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
 
 
 @law
-def frame_direction(heading_1: float, heading_2: float) -> tuple[float, float]:
-    """Return the direction (cosine, sine) of the frame the robots carry: along h1 + 0.8 h2.
+def frame_direction(s1: float, c1: float, s2: float, c2: float) -> tuple[float, float]:
+    """Return the direction (cosine, sine) of the frame the robots carry: along h1 + 0.8 h2, of headings (s, c).
 
     For parallel robots it is their mean heading. The plain mean does not exist for antiparallel ones, and no rule
     that treats both alike does; here robot 1 decides, smoothly.
     """
-    s1, c1 = sincos(heading_1)
-    s2, c2 = sincos(heading_2)
     x, y = c1 + SECOND_ROBOT_WEIGHT * c2, s1 + SECOND_ROBOT_WEIGHT * s2
     norm = math.sqrt(x * x + y * y)
     return x / norm, y / norm
@@ -144,7 +150,9 @@ def frame_direction(heading_1: float, heading_2: float) -> tuple[float, float]:
 @kernel
 def robots_frame(heading_1: float, heading_2: float) -> float:
     """Return the heading (rad) of the frame the robots carry."""
-    c, s = frame_direction(heading_1, heading_2)
+    s1, c1 = sincos(heading_1)
+    s2, c2 = sincos(heading_2)
+    c, s = frame_direction(s1, c1, s2, c2)
     return arctan2(s, c)
 
 
@@ -176,9 +184,22 @@ def _to_epms(poses: Floats, epms: Floats) -> None:
 
 
 @kernel
-def _to_poses(epms: Floats, poses: Floats) -> None:
-    for i in range(len(epms)):
-        epm_to_pose(epms[i], poses[i])
+def epms_to_poses(epms: Floats, first: int, last: int, poses: Floats) -> None:
+    """Write the poses (n, 5) of the EPMs (n, 6) from ``first`` to ``last``, in blocks whose angles are vectorised."""
+    across, along, angles = np.empty(4 * _BLOCK), np.empty(4 * _BLOCK), np.empty(4 * _BLOCK)
+    for start in range(first, last, _BLOCK):
+        end = min(start + _BLOCK, last)
+        for i in range(start, end):
+            e, at = epms[i], 4 * (i - start)
+            across[at], along[at] = e[1], e[0]
+            across[at + 1], along[at + 1] = e[2], math.sqrt(e[0] * e[0] + e[1] * e[1])
+            across[at + 2], along[at + 2] = e[4], e[3]
+            across[at + 3], along[at + 3] = e[5], math.sqrt(e[3] * e[3] + e[4] * e[4])
+        arctan2_all(across, along, 4 * (end - start), angles)
+        for i in range(start, end):
+            at = 4 * (i - start)
+            poses[i, 0], poses[i, 1], poses[i, 3], poses[i, 4] = angles[at], angles[at + 1], angles[at + 2], angles[at + 3]
+            poses[i, 2] = math.sqrt(epms[i, 0] * epms[i, 0] + epms[i, 1] * epms[i, 1] + epms[i, 2] * epms[i, 2])
 
 
 def _as_rows(values: ArrayLike, width: int, name: str, must_be: str) -> Floats:
@@ -210,7 +231,7 @@ def from_cartesian(positions: ArrayLike, directions: ArrayLike) -> Floats:
     require(centres.shape == moments.shape, "directions", f"of the shape of positions {centres.shape}", moments.shape)
     epms = np.concatenate([centres, moments], axis=-1).reshape(-1, 6)
     poses = np.empty((len(epms), POSE_SIZE))
-    _to_poses(epms, poses)
+    epms_to_poses(epms, 0, len(epms), poses)
     return poses.reshape(*centres.shape[:-2], -1)
 
 

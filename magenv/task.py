@@ -26,7 +26,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.angles import sincos, wrap
+from magenv.angles import sincos_all, wrap
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 from magenv.poses import frame_direction
@@ -43,6 +43,7 @@ LENGTH_SCALE_M = 0.1
 SPEED_SCALE_MPS = 0.01
 PREVIEW_SCALE_M = 0.01
 
+_BLOCK = 64  # rows whose angles are vectorised together
 _ROBOTS, _RATES, _SEPARATION, _FRAME, _PREVIEW, _EPMS = 8, 16, 22, 23, 25, 49
 _EPM_SIZE = 7
 _ERRORS_SIZE = 8
@@ -119,10 +120,15 @@ def _observe(
     period: float,
     r_max: float,
     carried: bool,
+    sines: Floats,
+    cosines: Floats,
     full: Floats,
 ) -> None:
-    """Write all parts of one observation into ``full``; ``references`` (5, 2, 3)."""
-    frame_c, frame_s = frame_direction(measured[0, 2], measured[1, 2])
+    """Write all parts of one observation into ``full``.
+
+    ``references`` (5, 2, 3); sines and cosines (4,) of both headings and of both heading errors.
+    """
+    frame_c, frame_s = frame_direction(sines[0], cosines[0], sines[1], cosines[1])
     c, s = (frame_c, frame_s) if carried else (1.0, 0.0)
     for robot in range(2):
         error, pose, rate = 4 * robot, _ROBOTS + 4 * robot, _RATES + 3 * robot
@@ -130,11 +136,10 @@ def _observe(
         target_x, target_y, target_heading = references[0, robot, 0], references[0, robot, 1], references[0, robot, 2]
         along, across = _turn(target_x - x, target_y - y, c, s)
         full[error], full[error + 1] = along / ERROR_SCALE_M, across / ERROR_SCALE_M
-        full[error + 2], full[error + 3] = sincos(target_heading - heading)
+        full[error + 2], full[error + 3] = sines[2 + robot], cosines[2 + robot]
         along, across = _turn(x, y, c, s)
         full[pose], full[pose + 1] = along / LENGTH_SCALE_M, across / LENGTH_SCALE_M
-        sine, cosine = sincos(heading)
-        full[pose + 3], full[pose + 2] = _turn(cosine, sine, c, s)
+        full[pose + 3], full[pose + 2] = _turn(cosines[robot], sines[robot], c, s)
         along, across = _turn(x - before[robot, 0], y - before[robot, 1], c, s)
         full[rate], full[rate + 1] = along / (period * SPEED_SCALE_MPS), across / (period * SPEED_SCALE_MPS)
         full[rate + 2] = wrap(heading - before[robot, 2]) / period
@@ -172,16 +177,26 @@ def observe_rows(
     out: NDArray[np.float32],
 ) -> None:
     """Write the observations (n, d) of rows ``first`` to ``last``; the arguments are those of ``World``."""
-    references = np.empty((PREVIEW, 2, 3))
+    references = np.empty((_BLOCK, PREVIEW, 2, 3))
+    angles, sines, cosines = np.empty(4 * _BLOCK), np.empty(4 * _BLOCK), np.empty(4 * _BLOCK)
     full = np.empty(_EPMS + _EPM_SIZE * epms.shape[1])
-    for i in range(first, last):
-        which = trajectory_of(i, len(duration))
-        for k in range(PREVIEW):
-            reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, references[k])
-        _observe(measured[i], before[i], references, epms[i], period, r_max, carried, full)
-        for j in range(out.shape[1]):
-            value = np.float32(full[j]) if abs(full[j]) < math.inf else np.float32(0.0)
-            out[i, j] = min(max(value, -bounds[j]), bounds[j])
+    for start in range(first, last, _BLOCK):
+        end = min(start + _BLOCK, last)
+        for i in range(start, end):
+            which, reference = trajectory_of(i, len(duration)), references[i - start]
+            for k in range(PREVIEW):
+                reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, reference[k])
+            for robot in range(2):
+                angles[4 * (i - start) + robot] = measured[i, robot, 2]
+                angles[4 * (i - start) + 2 + robot] = reference[0, robot, 2] - measured[i, robot, 2]
+        sincos_all(angles, 4 * (end - start), sines, cosines)
+        for i in range(start, end):
+            at = slice(4 * (i - start), 4 * (i - start) + 4)
+            reference, s, c = references[i - start], sines[at], cosines[at]
+            _observe(measured[i], before[i], reference, epms[i], period, r_max, carried, s, c, full)
+            for j in range(out.shape[1]):
+                value = np.float32(full[j]) if abs(full[j]) < math.inf else np.float32(0.0)
+                out[i, j] = min(max(value, -bounds[j]), bounds[j])
 
 
 def unpack(observation: ArrayLike, layout: Layout) -> Parts:

@@ -15,7 +15,7 @@ from magenv.hold import LOSSES, hold_kernel
 from magenv.kernels import kernel, law
 from magenv.lanes import CONSTANTS_SIZE
 from magenv.params import Plant, System, TaskParams
-from magenv.poses import POSE_SIZE, epm_to_pose
+from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
 from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel, trajectory_of
 from magenv.workers import Workers
 
@@ -105,14 +105,21 @@ def _time_rows(step: Integers, counts: Integers, period: float, substeps: int, o
 
 
 @kernel
-def _reference_rows(
-    first: int, last: int, coefficients: Floats, duration: Floats, time: Floats, epms: Floats, references: Floats, poses: Floats
+def _describe_rows(
+    first: int,
+    last: int,
+    coefficients: Floats,
+    duration: Floats,
+    time: Floats,
+    epms: Floats,
+    references: Floats,
+    poses: Floats,
 ) -> None:
     for i in range(first, last):
         which = trajectory_of(i, len(duration))
         reference_kernel(coefficients[which], duration[which], time[i], references[i])
-        for k in range(epms.shape[1]):
-            epm_to_pose(epms[i, k], poses[i, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
+    n_epm = epms.shape[1]
+    epms_to_poses(epms.reshape(-1, EPM_SIZE), first * n_epm, last * n_epm, poses.reshape(-1, POSE_SIZE))
 
 
 class World:
@@ -239,6 +246,6 @@ class World:
         n, n_epm = self.epms.shape[:2]
         time, references, poses = self.time_s(), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
         self._workers.run(
-            _reference_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses
+            _describe_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses
         )
         return time, references, poses

@@ -22,7 +22,7 @@ from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import to_cartesian
 from magenv.task import Layout
 from magenv.trajectories import draw
-from magenv.world import wrap
+from magenv.angles import wrap
 from magenv.wrench import planar_moments, robot_wrench
 
 Floats = NDArray[np.float64]

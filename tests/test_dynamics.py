@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from magenv.actions import WRENCH_FORCE_N, WRENCH_TORQUE_NM, Actions
 from magenv.dipole import field
-from magenv.dynamics import TOUCH, WALL, Physics, advance, drag_factors, planar_wrench, resolve_contact
+from magenv.dynamics import TOUCH, WALL, Physics, advance, constants, may_touch, planar_wrench, resolve_contact
+from magenv.lanes import CONSTANTS, CONSTANTS_SIZE, EPMS, fields
 from magenv.params import PLANTS, Body, Plant, System, TaskParams
 from magenv.poses import from_cartesian, pose_bounds, project, to_cartesian
 from magenv.trajectories import approach, draw
-from magenv.world import LOSSES, World, wrap
+from magenv.world import LOSSES, World
 from magenv.wrench import planar_moments, robot_wrench
 
 Floats = NDArray[np.float64]
@@ -46,15 +47,33 @@ def magnets(rng: np.random.Generator, system: System = SYSTEM) -> Floats:
     return np.concatenate(to_cartesian(pose), axis=-1)
 
 
+def one_lane(robots: Floats, epms: Floats, physics: Physics, h: float) -> Floats:
+    """A single lane (fields, 1) with these robots (2, 6) and EPMs (N, 6)."""
+    lane, row = np.zeros((fields(len(epms)), 1)), np.empty((1, CONSTANTS_SIZE))
+    constants(physics, h, row)
+    lane[:12, 0] = robots.reshape(-1)
+    lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row
+    lane[EPMS:, 0] = (epms * ([1.0] * 3 + [physics.epm_moment[0]] * 3)).reshape(-1)
+    return lane
+
+
+def wrenches(robots: Floats, epms: Floats, system: System, ipm_moment: Floats | None = None) -> Floats:
+    """F_x, F_y, tau_z (2, 3) on the robots."""
+    physics = Physics.of(system, WIDE, 1)
+    if ipm_moment is not None:
+        physics.ipm_moment[0] = ipm_moment
+    lane = one_lane(robots, epms, physics, 0.005)
+    return np.array(planar_wrench(lane, 0, len(epms), *robots[0, :3], *robots[1, :3])).reshape(2, 3)
+
+
 def run(robots: Floats, epms: Floats, plant: Plant, h: float, steps: int, system: System = SYSTEM) -> Floats:
     """Return the states (steps + 1, 2, 6) of a run without contact."""
-    physics = Physics.of(system, plant, 1)
-    factors, force, state = np.empty((2, 3, 2)), np.empty((2, 3)), robots.copy()
-    drag_factors(physics, 0, h, factors)
-    path = [state.copy()]
+    lane = one_lane(robots, epms, Physics.of(system, plant, 1), h)
+    path = [robots.copy()]
     for _ in range(steps):
-        assert advance(state, epms, physics, 0, h, factors, force) == 0
-        path.append(state.copy())
+        advance(lane, 0, len(epms), h)
+        assert not may_touch(lane, 0, plant.body.diameter_m, plant.workspace_radius_m)
+        path.append(lane[:12, 0].reshape(2, 6).copy())
     return np.array(path)
 
 
@@ -75,8 +94,8 @@ def energy(robots: Floats, epms: Floats, body: Body) -> float:
 def test_planar_wrench_is_the_planar_part_of_u(rng: np.random.Generator, n_epm: int) -> None:
     system = System(n_epm=n_epm)
     for robots in states(rng, 20):
-        epms, out = magnets(rng, system), np.empty((2, 3))
-        planar_wrench(robots, epms, np.full(2, system.ipm_moment_am2), system.epm_moment_am2, out)
+        epms = magnets(rng, system)
+        out = wrenches(robots, epms, system)
         positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=-1)
         pose = from_cartesian(epms[:, :3], epms[:, 3:])
         moments = planar_moments(robots[:, 2], system.ipm_moment_am2)
@@ -87,10 +106,9 @@ def test_planar_wrench_is_the_planar_part_of_u(rng: np.random.Generator, n_epm: 
 
 
 def test_force_between_robots_cancels_to_the_last_bit(rng: np.random.Generator) -> None:
-    """Third law in the plant; the EPM's own moment is zero here."""
+    """Third law in the plant; there are no EPMs here."""
     for robots in states(rng, 20):
-        out = np.empty((2, 3))
-        planar_wrench(robots, magnets(rng), np.array([0.1, 0.2]), 0.0, out)
+        out = wrenches(robots, np.zeros((0, 6)), SYSTEM, np.array([0.1, 0.2]))
         np.testing.assert_array_equal(out[0, :2], -out[1, :2])
         dx, dy = robots[1, :2] - robots[0, :2]
         total = out[0, 2] + out[1, 2] + dx * out[1, 1] - dy * out[1, 0]
@@ -139,8 +157,7 @@ def test_terminal_velocity_is_exact_however_strong_the_drag(rng: np.random.Gener
     body = Body(mass_kg=1e-6, inertia_kgm2=1e-10, drag_linear_nspm=10.0, drag_rotational_nmsprad=1e-3)
     plant, epms = Plant(body=body), magnets(rng)
     before, after = run(states(rng)[0] * [1, 1, 1, 0, 0, 0], epms, plant, 0.005, 1)
-    force = np.empty((2, 3))
-    planar_wrench(before, epms, np.full(2, SYSTEM.ipm_moment_am2), SYSTEM.epm_moment_am2, force)
+    force = wrenches(before, epms, SYSTEM)
     np.testing.assert_allclose(after[:, 3:], force / [10.0, 10.0, 1e-3], rtol=1e-13)
 
 
@@ -241,27 +258,25 @@ def test_bodies_overlap_neither_each_other_nor_the_wall(rng: np.random.Generator
 
 def test_attracted_robots_never_pass_through_each_other(rng: np.random.Generator) -> None:
     """Let go head to tail at 15 to 30 mm they meet, touch and stay a diameter apart."""
-    physics, h = Physics.of(SYSTEM, PLANTS["paper"], 1), PLANTS["paper"].substep_s
-    factors, force = np.empty((2, 3, 2)), np.empty((2, 3))
-    drag_factors(physics, 0, h, factors)
+    plant = PLANTS["paper"]
+    physics, h = Physics.of(SYSTEM, plant, 1), plant.substep_s
     for distance in np.linspace(0.015, 0.030, 16):
         state = np.zeros((2, 6))
         state[1, 0] = distance
-        flags = 0
+        lane, flags = one_lane(state, np.zeros((0, 6)), physics, h), 0
         for _ in range(400):
-            flags |= advance(state, np.zeros((0, 6)), physics, 0, h, factors, force)
+            advance(lane, 0, 0, h)
+            near = may_touch(lane, 0, DIAMETER, plant.workspace_radius_m)
+            state = lane[:12, 0].reshape(2, 6).copy()
+            contact = resolve_contact(state, physics.mass[0], DIAMETER, plant.workspace_radius_m)
+            assert near or not contact
+            lane[:12, 0] = state.reshape(-1)
+            flags |= contact
             assert state[1, 0] - state[0, 0] >= DIAMETER - 1e-12
         assert flags == TOUCH
 
 
 # The world
-
-
-def test_wrap() -> None:
-    angles = np.linspace(-20.0, 20.0, 999)
-    wrapped = np.array([wrap(a) for a in angles])
-    assert np.abs(wrapped).max() <= math.pi
-    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-13)
 
 
 def test_world_measures_the_true_state_at_every_substep(rng: np.random.Generator) -> None:

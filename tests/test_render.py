@@ -209,7 +209,8 @@ def test_trails_grow_restart_forgets_them_and_another_path_replaces_the_first() 
 
 def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
     episodes = Episodes(1, Settings("approach-30"))
-    episodes.start(0, np.random.default_rng(0))
+    episodes.seed(0, np.random.default_rng(0))
+    episodes.start(np.ones(1, np.bool_))
     world, active = episodes.world, np.ones(1, np.bool_)
     kept = 0
     scene = scene_of(world, 0)
@@ -223,14 +224,16 @@ def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
     assert kept > 0
     apart = world.robots[0, 1, :2] - world.robots[0, 0, :2]
     assert scene.separation_m == pytest.approx(float(np.hypot(*apart)))
-    episodes.start(0, np.random.default_rng(0))
+    episodes.seed(0, np.random.default_rng(0))
+    episodes.start(np.ones(1, np.bool_))
     assert scene_of(world, 0).loss == 0
 
 
 def test_a_scene_does_not_follow_the_world() -> None:
     episodes = Episodes(2, Settings("approach-60"))
     for row in range(2):
-        episodes.start(row, np.random.default_rng(row))
+        episodes.seed(row, np.random.default_rng(row))
+    episodes.start(np.ones(2, np.bool_))
     scene = scene_of(episodes.world, 1)
     names = ("robots", "reference", "path", "epm_positions", "epm_directions")
     before = {name: getattr(scene, name).copy() for name in names}

@@ -114,7 +114,8 @@ def test_pose_errors_come_first_scaled(make_env: MakeEnv) -> None:
 def test_rate_is_the_shortest_turn(turn: float) -> None:
     """A heading that passes the cut between pi and -pi from one measurement to the next is no fast turn."""
     episodes = Episodes(1, Settings(frame="global"))
-    episodes.start(0, np.random.default_rng(0))
+    episodes.seed(0, np.random.default_rng(0))
+    episodes.start(np.ones(1, np.bool_))
     episodes._measured[0, 1, 2] = episodes._before[0, 1, 2] + turn
     rate = unpack(episodes.observe()[0], episodes.layout).rates[1, 2]
     assert rate == pytest.approx(math.remainder(turn, 2 * math.pi) / 0.5, rel=1e-6)
@@ -144,7 +145,8 @@ def test_robots_frame_observation_does_not_change_when_the_scene_turns(n_epm: in
     change = {}
     for frame, batch in episodes.items():
         for row in range(8):
-            batch.start(row, np.random.default_rng(row))
+            batch.seed(row, np.random.default_rng(row))
+        batch.start(np.ones(8, np.bool_))
         batch.step(actions, np.ones(8, np.bool_))
         before = batch.observe()
         turned_scene(batch, angle)
@@ -162,7 +164,8 @@ def test_a_turned_episode_stays_turned_in_home_mode(angle: float) -> None:
     straight, turned = (Episodes(6, Settings(control_hz=10.0)) for _ in range(2))
     for batch in (straight, turned):
         for row in range(6):
-            batch.start(row, np.random.default_rng(row))
+            batch.seed(row, np.random.default_rng(row))
+        batch.start(np.ones(6, np.bool_))
     turned_scene(turned, angle)
     rng, active = np.random.default_rng(0), np.ones(6, np.bool_)
     for _ in range(3):
@@ -219,9 +222,9 @@ def test_observations_stay_within_the_space_under_extreme_actions(
 
 def test_reward_terms_fall_from_one_to_zero() -> None:
     error = np.array([0.0, *np.geomspace(1e-5, 1e3, 60)])
-    position, heading = np.empty(61), np.empty(61)
-    reward_rows(error, error, position, heading)
-    for term, scales in ((position, POSITION_SCALES_M), (heading, HEADING_SCALES_RAD)):
+    terms = np.empty((2, 61))
+    reward_rows(error, error, terms)
+    for term, scales in zip(terms, (POSITION_SCALES_M, HEADING_SCALES_RAD), strict=True):
         assert term[0] == 1.0
         assert (np.diff(term) < 0).all()
         assert 0 < term[-1] < 1e-6
