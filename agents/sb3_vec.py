@@ -6,12 +6,11 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from magenv.episodes import Settings
-from magenv.vector_env import TwoRobotsVector
+from magenv.episodes import Episodes, Settings, check_action
 
 EPISODE_KEYS = ("position_error_m", "heading_error_rad")
 """Means over each episode that its last info carries beside ``is_success``."""
@@ -24,22 +23,31 @@ class TwoRobotsVecEnv(VecEnv):
     ``episode`` (return, length) as ``VecMonitor`` would give it, and the episode's mean errors.
     """
 
+    render_mode: str | None = None
+
     def __init__(self, n: int, settings: Settings, seed: int) -> None:
-        self._env = TwoRobotsVector(n, **vars(settings), autoreset_mode=AutoresetMode.SAME_STEP)
-        super().__init__(n, self._env.single_observation_space, self._env.single_action_space)
+        self._episodes = Episodes(n, settings)
+        self.layout = self._episodes.layout
+        super().__init__(n, self._episodes.observation_space, self._episodes.action_space)
         self.seed(seed)
+        self._all = np.ones(n, np.bool_)
         self._actions: NDArray[np.float32] = np.zeros((n, 0), np.float32)
-        self._sums = {key: np.zeros(n) for key in (*EPISODE_KEYS, "reward")}
+        self._sums = np.zeros((len(EPISODE_KEYS) + 1, n))  # of the errors, then of the reward
         self._lengths = np.zeros(n, np.int64)
 
     def reset(self) -> NDArray[np.float32]:
         """Begin all episodes; after ``seed`` from there, else further along the same random streams."""
-        observations, _ = self._env.reset(seed=list(self._seeds))
+        for row, seed in enumerate(self._seeds):
+            if seed is not None:
+                self._episodes.seed(row, seeding.np_random(seed)[0])
         self._reset_seeds()
-        for total in self._sums.values():
-            total[:] = 0.0
-        self._lengths[:] = 0
-        return observations
+        self._begin(self._all)
+        return self._episodes.observe()
+
+    def _begin(self, mask: NDArray[np.bool_]) -> None:
+        self._episodes.start(mask)
+        self._sums[:, mask] = 0.0
+        self._lengths[mask] = 0
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Keep the actions for ``step_wait``."""
@@ -47,36 +55,39 @@ class TwoRobotsVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all episodes."""
-        observations, rewards, terminated, truncated, info = self._env.step(self._actions)
-        dones = terminated | truncated
-        last = info.get("final_info", {})
-        for key in EPISODE_KEYS:
-            self._sums[key] += np.where(dones, last.get(key, 0.0), info[key])
-        self._sums["reward"] += rewards
+        episodes = self._episodes
+        actions = check_action(self._actions, (self.num_envs, episodes.actions.size))
+        rewards, terminated, truncated = episodes.step(actions, self._all)
+        measured = episodes.world.measurements
+        for total, value in zip(self._sums, (*(getattr(measured, key) for key in EPISODE_KEYS), rewards), strict=True):
+            total += value
         self._lengths += 1
+        observations = episodes.observe()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for row in np.flatnonzero(dones):
-            length = int(self._lengths[row])
-            infos[row] = {
-                "terminal_observation": info["final_obs"][row],
-                "TimeLimit.truncated": bool(truncated[row]),
-                "is_success": bool(truncated[row]),
-                "episode": {"r": float(self._sums["reward"][row]), "l": length, "t": 0.0},
-            }
-            for key in EPISODE_KEYS:
-                infos[row][key] = float(self._sums[key][row] / length)
-            for total in self._sums.values():
-                total[row] = 0.0
-            self._lengths[row] = 0
+        dones = terminated | truncated
+        if dones.any():
+            rows = np.flatnonzero(dones)
+            lengths, sums = self._lengths[rows], self._sums[:, rows]
+            means = (sums[:-1] / lengths).T.tolist()
+            ends = zip(rows.tolist(), truncated[rows].tolist(), sums[-1].tolist(), lengths.tolist(), means, strict=True)
+            for row, kept, total, length, errors in ends:
+                infos[row] = {
+                    "terminal_observation": observations[row],
+                    "TimeLimit.truncated": kept,
+                    "is_success": kept,
+                    "episode": {"r": total, "l": length, "t": 0.0},
+                    **dict(zip(EPISODE_KEYS, errors, strict=True)),
+                }
+            self._begin(dones)
+            observations = episodes.observe()
         return observations, rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
-        """Close the batched environment."""
-        self._env.close()
+        """Do nothing: there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of the batched environment once per index."""
-        return [getattr(self._env, attr_name)] * len(list(self._get_indices(indices)))
+        """Return an attribute of this adapter once per index."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Refuse: the episodes share one environment."""
