@@ -20,17 +20,17 @@ from magenv.angles import sincos, sincos_all
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 from magenv.poses import (
+    EPM_SIZE,
     HOME_RADIUS_M,
     POSE_SIZE,
     epm_to_pose,
     frame_direction,
     home_pose,
-    pose_bounds,
     place_epm,
+    pose_bounds,
     pose_to_epm,
     project_epms,
     robots_frame,
-    to_cartesian,
 )
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
@@ -120,7 +120,15 @@ def _start_rows(mask: Bools, measured: Floats, home_epms: Floats, limits: Floats
 
 @kernel
 def _pose_rows(
-    first: int, last: int, active: Bools, actions: Floats, low: Floats, high: Floats, limits: Floats, targets: Floats, projected: Bools
+    first: int,
+    last: int,
+    active: Bools,
+    actions: Floats,
+    low: Floats,
+    high: Floats,
+    limits: Floats,
+    targets: Floats,
+    projected: Bools,
 ) -> None:
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
@@ -135,7 +143,16 @@ def _pose_rows(
 
 
 @kernel
-def _step_rows(first: int, last: int, active: Bools, actions: Floats, epms: Floats, limits: Floats, targets: Floats, projected: Bools) -> None:
+def _step_rows(
+    first: int,
+    last: int,
+    active: Bools,
+    actions: Floats,
+    epms: Floats,
+    limits: Floats,
+    targets: Floats,
+    projected: Bools,
+) -> None:
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
         if not active[i]:
@@ -233,7 +250,9 @@ class Actions:
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
         self._home = home_pose(system.n_epm)
-        self._home_epms = np.concatenate(to_cartesian(self._home), axis=-1)
+        self._home_epms = np.empty((system.n_epm, EPM_SIZE))
+        for epm, (a, e, radius, b, f) in zip(self._home_epms, self._home.reshape(-1, POSE_SIZE), strict=True):
+            place_epm(radius, *sincos(a), *sincos(e), *sincos(b), *sincos(f), epm)
         self._low, self._high = pose_bounds(system)
         # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))

@@ -26,7 +26,8 @@ _ATAN_SPLIT = 0.66
 @law
 def wrap(angle: float) -> float:
     """Return ``angle`` in [-pi, pi]."""
-    return angle - 2.0 * math.pi * np.floor(angle * _TURNS + 0.5)
+    wrapped: float = angle - 2.0 * math.pi * np.floor(angle * _TURNS + 0.5)
+    return wrapped
 
 
 @law

@@ -214,5 +214,5 @@ def may_touch(lanes: Floats, i: int, diameter: float, wall_radius: float) -> boo
     near, far = diameter * _SLIGHTLY_MORE, (wall_radius - 0.5 * diameter) / _SLIGHTLY_MORE
     x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
     dx, dy = x2 - x1, y2 - y1
-    touch = dx * dx + dy * dy < near * near
-    return touch | (x1 * x1 + y1 * y1 > far * far) | (x2 * x2 + y2 * y2 > far * far)
+    touch: bool = (dx * dx + dy * dy < near * near) | (x1 * x1 + y1 * y1 > far * far) | (x2 * x2 + y2 * y2 > far * far)
+    return touch

@@ -76,7 +76,8 @@ def _count(lanes: Floats, i: int, h: float) -> bool:
     done = lanes[DONE, i] + 1.0
     progress = spline_position(lanes[START, i] + done * h, lanes[SEGMENT_RATE, i]) - lanes[SEGMENT, i]
     lanes[DONE, i], lanes[PROGRESS, i] = done, progress
-    return progress > 1.0
+    ended: bool = progress > 1.0
+    return ended
 
 
 @law
@@ -100,7 +101,8 @@ def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, track
     tracks = (first <= tracking_distance) & (second <= tracking_distance)
     lanes[SEPARATION_TRACKED, i] = separation if tracks else lanes[SEPARATION_TRACKED, i]
     near = (first <= loss_distance) & (second <= loss_distance)  # false for NaN as well
-    return (not near) | (lanes[CONTACT, i] > 0.0) | (lanes[DONE, i] == substeps)
+    over: bool = (not near) | (lanes[CONTACT, i] > 0.0) | (lanes[DONE, i] == substeps)
+    return over
 
 
 @law

@@ -34,12 +34,12 @@ def _cache_dir() -> Path:
 _CACHE_DIR = str(_cache_dir())
 
 
-def _compile(function: Function, **options: bool) -> Function:
+def _compile(function: Function, inlined: bool) -> Function:
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = _CACHE_DIR
     try:
-        compiled: Any = numba.njit(cache=True, error_model="numpy", **options)(function)
+        compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=inlined)(function)
     finally:
         config.CACHE_DIR = before
     return cast("Function", compiled)
@@ -52,7 +52,7 @@ def kernel(function: Function) -> Function:
     mathematics, contraction of products and sums included: NaN and infinity stay visible, and scalar and batched calls
     give the same bits. Kernels release the interpreter lock, so that threads may share a batch.
     """
-    return _compile(function, nogil=True)
+    return _compile(function, inlined=False)
 
 
 def law(function: Function) -> Function:
@@ -60,4 +60,4 @@ def law(function: Function) -> Function:
 
     Only so can LLVM vectorise the loop; the law still stands once.
     """
-    return _compile(function, nogil=True, forceinline=True)
+    return _compile(function, inlined=True)

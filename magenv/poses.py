@@ -49,11 +49,19 @@ def place_epm(
 @law
 def pose_to_epm(pose: Floats, epm: Floats) -> None:
     """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
-    sa, ca = sincos(pose[0])
-    se, ce = sincos(pose[1])
-    sb, cb = sincos(pose[3])
-    sf, cf = sincos(pose[4])
-    place_epm(pose[2], sa, ca, se, ce, sb, cb, sf, cf, epm)
+    a, e, b, f = pose[0], pose[1], pose[3], pose[4]
+    place_epm(
+        pose[2],
+        math.sin(a),
+        math.cos(a),
+        math.sin(e),
+        math.cos(e),
+        math.sin(b),
+        math.cos(b),
+        math.sin(f),
+        math.cos(f),
+        epm,
+    )
 
 
 @kernel
@@ -198,7 +206,12 @@ def epms_to_poses(epms: Floats, first: int, last: int, poses: Floats) -> None:
         arctan2_all(across, along, 4 * (end - start), angles)
         for i in range(start, end):
             at = 4 * (i - start)
-            poses[i, 0], poses[i, 1], poses[i, 3], poses[i, 4] = angles[at], angles[at + 1], angles[at + 2], angles[at + 3]
+            poses[i, 0], poses[i, 1], poses[i, 3], poses[i, 4] = (
+                angles[at],
+                angles[at + 1],
+                angles[at + 2],
+                angles[at + 3],
+            )
             poses[i, 2] = math.sqrt(epms[i, 0] * epms[i, 0] + epms[i, 1] * epms[i, 1] + epms[i, 2] * epms[i, 2])
 
 

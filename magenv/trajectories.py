@@ -22,6 +22,7 @@ Keys = NDArray[np.uint64]
 
 SEGMENTS = 32
 """Spline segments of every trajectory."""
+_AXES = 6  # x, y, heading of both robots
 DURATION_S = 100.0
 HALF_LENGTH_M = 0.060
 """The approach scenarios run from -60 mm to 60 mm in x."""
@@ -99,30 +100,30 @@ def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
     s[k-1] + 4 s[k] + s[k+1] = 3 (y[k+1] - y[k-1]), and the third at the first and last inner knot,
     s[0] + 2 s[1] = (-5 y[0] + 4 y[1] + y[2]) / 2 and its mirror image: a tridiagonal system without the end slopes.
     """
-    end, pivot = SEGMENTS, np.empty(SEGMENTS)
-    for k in range(1, end):
-        pivot[k] = 2.0 if k == 1 else (2.0 if k == end - 1 else 4.0) - 1.0 / pivot[k - 1]
-    for robot in range(2):
-        for axis in range(3):
-            y, s = knots[:, robot, axis], slopes[:, robot, axis]
-            s[0] = 0.5 * (-5.0 * y[0] + 4.0 * y[1] + y[2])
-            s[end] = 0.5 * (5.0 * y[end] - 4.0 * y[end - 1] - y[end - 2])
-            for k in range(1, end):
-                right = 3.0 * (y[k + 1] - y[k - 1])
-                if k == 1:
-                    right -= s[0]
-                else:
-                    right -= s[k - 1] / pivot[k - 1]
-                s[k] = right - (s[end] if k == end - 1 else 0.0)
-            s[end - 1] /= pivot[end - 1]
-            for k in range(end - 2, 0, -1):
-                s[k] = (s[k] - s[k + 1]) / pivot[k]
-            s[0] -= 2.0 * s[1]
-            s[end] -= 2.0 * s[end - 1]
-            for k in range(end):
-                c, rise = coefficients[robot, k, axis], y[k + 1] - y[k]
-                c[0], c[1] = y[k], s[k]
-                c[2], c[3] = 3.0 * rise - 2.0 * s[k] - s[k + 1], s[k] + s[k + 1] - 2.0 * rise
+    end, y, s = SEGMENTS, knots.reshape(-1, _AXES), slopes.reshape(-1, _AXES)
+    inverse = np.empty(SEGMENTS)  # of the pivots of Gaussian elimination
+    inverse[1] = 0.5
+    for k in range(2, end):
+        inverse[k] = 1.0 / ((2.0 if k == end - 1 else 4.0) - inverse[k - 1])
+    for j in range(_AXES):
+        s[0, j] = 0.5 * (-5.0 * y[0, j] + 4.0 * y[1, j] + y[2, j])
+        s[end, j] = 0.5 * (5.0 * y[end, j] - 4.0 * y[end - 1, j] - y[end - 2, j])
+        s[1, j] = 3.0 * (y[2, j] - y[0, j]) - s[0, j]
+    for k in range(2, end):
+        for j in range(_AXES):
+            s[k, j] = 3.0 * (y[k + 1, j] - y[k - 1, j]) - s[k - 1, j] * inverse[k - 1]
+    for j in range(_AXES):
+        s[end - 1, j] = (s[end - 1, j] - s[end, j]) * inverse[end - 1]
+    for k in range(end - 2, 0, -1):
+        for j in range(_AXES):
+            s[k, j] = (s[k, j] - s[k + 1, j]) * inverse[k]
+    for j in range(_AXES):
+        s[0, j] -= 2.0 * s[1, j]
+        s[end, j] -= 2.0 * s[end - 1, j]
+    for k in range(end):
+        for j in range(_AXES):
+            c, rise, s0, s1 = coefficients[j // 3, k, j % 3], y[k + 1, j] - y[k, j], s[k, j], s[k + 1, j]
+            c[0], c[1], c[2], c[3] = y[k, j], s0, 3.0 * rise - 2.0 * s0 - s1, s0 + s1 - 2.0 * rise
 
 
 def _along_path(positions: Floats, velocities: Floats, flip_second: bool) -> Floats:

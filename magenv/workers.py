@@ -6,6 +6,7 @@ its own. (Numba's own pools spin, abort on concurrent use or do not survive a fo
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +36,7 @@ class Workers:
         if self._pool is None or self._owner != os.getpid():  # threads do not survive a fork
             self._pool, self._owner = ThreadPoolExecutor(self.threads - 1, "magenv"), os.getpid()
         ends = [rows * k // self.threads for k in range(self.threads + 1)]
-        others = [self._pool.submit(kernel, *part, *arguments) for part in zip(ends[1:-1], ends[2:], strict=True)]
+        others = [self._pool.submit(kernel, *part, *arguments) for part in itertools.pairwise(ends[1:])]
         kernel(ends[0], ends[1], *arguments)
         for other in others:
             other.result()

@@ -75,8 +75,14 @@ class Measurements:
 
 @kernel
 def _begin_rows(
-    mask: Bools, robots: Floats, coefficients: Floats, duration: Floats, tracking_distance: float,
-    step: Integers, numbers: Floats, counts: Integers,
+    mask: Bools,
+    robots: Floats,
+    coefficients: Floats,
+    duration: Floats,
+    tracking_distance: float,
+    step: Integers,
+    numbers: Floats,
+    counts: Integers,
 ) -> None:
     reference = np.empty((2, 3))
     for i in range(len(mask)):
@@ -245,7 +251,5 @@ class World:
         """Return times (n,), references (n, 2, 3) at these times and the EPMs' pose vectors (n, 5 N)."""
         n, n_epm = self.epms.shape[:2]
         time, references, poses = self.time_s(), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
-        self._workers.run(
-            _describe_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses
-        )
+        self._workers.run(_describe_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses)
         return time, references, poses

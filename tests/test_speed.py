@@ -1,0 +1,192 @@
+"""What makes the batch fast, and that it changes no bit: lanes, threads, machine code, starts drawn ahead."""
+
+from __future__ import annotations
+
+import platform
+import re
+import subprocess
+import sys
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magenv.env import TwoRobots
+from magenv.hold import hold_kernel
+from magenv.params import System, TaskParams
+from magenv.trajectories import approach
+from magenv.vector_env import TwoRobotsVector
+from magenv.workers import Workers
+from magenv.world import World
+
+N = 37
+"""Episodes: more than the lanes, and no multiple of them."""
+STEPS = 40
+
+Steps = list[tuple[NDArray[Any], ...]]
+
+
+def actions(row: int, step: int, size: int) -> NDArray[np.float32]:
+    """Actions that differ from row to row and from step to step, some gentle, some wild."""
+    rng = np.random.default_rng([row, step])
+    return (rng.uniform(-1, 1, size) * [0.1, 1.0][row % 2]).astype(np.float32)
+
+
+def batch(n: int, first: int, threads: int = 1, **arguments: Any) -> Steps:
+    """Observations, rewards and flags of episodes of seeds ``first``, ``first`` + 1, ..."""
+    env = TwoRobotsVector(n, threads=threads, **arguments)
+    size = env.single_action_space.shape[0]  # type: ignore[index]
+    told: Steps = [(env.reset(seed=first)[0],)]
+    for step in range(STEPS):
+        told.append(env.step(np.stack([actions(first + row, step, size) for row in range(n)]))[:4])
+    return told
+
+
+def same(one: Steps, two: Steps, rows: slice) -> bool:
+    return all(
+        a[rows].tobytes() == b.tobytes() for x, y in zip(one, two, strict=True) for a, b in zip(x, y, strict=True)
+    )
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+@pytest.mark.parametrize("scenario", ["approach-45", "random"])
+def test_bits_depend_neither_on_lanes_nor_on_threads(scenario: str, n_epm: int) -> None:
+    """Many, few and single episodes, one to three threads, through many starts."""
+    arguments = {"scenario": scenario, "n_epm": n_epm, "control_hz": 10.0}
+    together = batch(N, 0, **arguments)
+    flags = np.array([step[2] for step in together[1:]])
+    assert flags.any(axis=0).mean() > 0.9, "most episodes must end and begin anew"
+    for threads in (2, 3):
+        assert same(together, batch(N, 0, threads, **arguments), slice(None))
+    for first, n in ((0, 5), (20, 17), (3, 1)):
+        assert same(together, batch(n, first, **arguments), slice(first, first + n))
+
+
+def test_a_scalar_environment_gives_the_bits_of_a_row_beyond_what_is_drawn_ahead() -> None:
+    together = batch(N, 0, scenario="random", control_hz=2.0)
+    env, row = TwoRobots(scenario="random", control_hz=2.0), 5
+    observation, ended, begun = env.reset(seed=row)[0], False, 0
+    for step, told in enumerate(together):
+        assert observation.tobytes() == told[0][row].tobytes()
+        if ended:
+            observation, ended = env.reset()[0], False
+            begun += 1
+        else:
+            observation, _, terminated, truncated, _ = env.step(actions(row, step, 10))
+            ended = terminated or truncated
+    assert begun > 5
+
+
+def test_many_starts_go_on_along_one_stream() -> None:
+    """A hundred episodes, more than are drawn at a time: none comes twice, and a new seed begins anew."""
+    env = TwoRobots(scenario="random")
+    first = [env.reset(seed=0)[0]] + [env.reset()[0] for _ in range(99)]
+    again = [env.reset(seed=0)[0]] + [env.reset()[0] for _ in range(99)]
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(first, axis=0)) == 100
+
+
+def test_a_generator_put_in_place_is_drawn_from() -> None:
+    env = TwoRobots(scenario="approach-60")
+    expected = env.reset(seed=3)[0]
+    env.reset(seed=4)
+    env.np_random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(3)))
+    np.testing.assert_array_equal(env.reset()[0], expected)
+
+
+def test_one_trajectory_is_kept_once() -> None:
+    """Rows of a named scenario share their reference; rows with one of their own give the same motion."""
+    system, task, trajectory = System(), TaskParams(), approach(0.05)
+    plant = TwoRobotsVector(1)._episodes.plant
+    shared, own = World(20, system, plant, task, trajectory), World(20, system, plant, task)
+    assert len(shared.coefficients) == 1
+    robots, epms = np.zeros((2, 6)), np.zeros((2, 6))
+    robots[:, :3], epms[:, 2], epms[:, 3] = trajectory.at(0.0), 0.2, 1.0
+    epms[1, 2] = -0.2
+    for row in range(20):
+        own.start(row, trajectory, robots, epms)
+        shared.robots[row] = robots
+    shared.begin(np.ones(20, np.bool_))
+    targets = np.tile(epms, (20, 1, 1))
+    one, two = (world.step(targets, np.ones(20, np.bool_)) for world in (shared, own))
+    np.testing.assert_array_equal(shared.robots, own.robots)
+    np.testing.assert_array_equal(one.numbers, two.numbers)
+
+
+# Machine code
+
+
+@pytest.fixture(scope="module")
+def compiled() -> Any:
+    """The hold of two EPMs in sixteen lanes, compiled here: numba does not show cached code."""
+    cached: Any = hold_kernel(2, 16)
+    world = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams())
+    world.step(world.epms, np.zeros(16, np.bool_))
+    fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
+    fresh.compile(cached.signatures[0])
+    return fresh
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+def test_substeps_are_vectorised(compiled: Any) -> None:
+    """Each of the five dipoles' divisions and square roots works on several lanes at once."""
+    (assembly,) = compiled.inspect_asm().values()
+    assert len(re.findall(r"\bv?divpd\b", assembly)) >= 5
+    assert len(re.findall(r"\bv?sqrtpd\b", assembly)) >= 5
+    assert not re.search(r"\bv?(mul|add)ps\b", assembly), "nothing is rounded to single precision"
+
+
+def test_the_hold_allocates_before_its_loops_and_calls_nothing_within(compiled: Any) -> None:
+    """No Python object; of library functions only the one of a contact; four arrays of scratch, however many rows."""
+    (ir,) = compiled.inspect_llvm().values()
+    functions = re.findall(r"^define .*?^}", ir, re.S | re.M)
+    (body,) = [text for text in functions if re.match(r'define [^\n]*@"?_ZN6magenv4hold', text)]
+    calls = re.findall(r'call [^@\n]*@"?([^"(\s]+)', body)
+    assert {name for name in calls if not name.startswith(("NRT_", "llvm."))} <= {"hypot"}
+    assert not re.search(r"llvm\.(sin|cos|exp|log|pow)", " ".join(calls))
+    assert sum("alloc" in name.lower() for name in calls) <= 4
+
+
+# Threads
+
+
+@pytest.mark.parametrize("threads", [0, -1, True, 1.5, "2"])
+def test_threads_must_be_a_whole_number(threads: Any) -> None:
+    with pytest.raises(ValueError, match=r"Input threads must be a whole number of at least 1"):
+        Workers(threads)
+
+
+def test_every_row_is_run_once_and_errors_are_told() -> None:
+    seen: list[int] = []
+    Workers(3).run(lambda first, last: seen.extend(range(first, last)), 20)
+    assert sorted(seen) == list(range(20))
+
+    def fail(first: int, last: int) -> None:
+        if last == 20:
+            raise ArithmeticError
+
+    with pytest.raises(ArithmeticError):
+        Workers(3).run(fail, 20)
+
+
+FORK = """
+import os, sys
+import numpy as np
+from magenv.vector_env import TwoRobotsVector
+env = TwoRobotsVector(8, scenario="approach-60", threads=2)
+env.reset(seed=0)
+env.step(np.zeros((8, 10), np.float32))
+child = os.fork()
+again = env.step(np.zeros((8, 10), np.float32))[0]
+assert np.isfinite(again).all()
+if child == 0:
+    os._exit(0)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(platform.system() == "Windows", reason="needs fork")
+def test_a_fork_after_a_threaded_step_works() -> None:
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], check=True, timeout=120)
