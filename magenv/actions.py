@@ -16,17 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.allocation import best_of, component_scales
-from magenv.angles import sincos, sincos_all
-from magenv.kernels import kernel, law
+from magenv.home import home_epms, home_rows, start_rows
+from magenv.kernels import kernel
 from magenv.params import System, require
 from magenv.poses import (
-    EPM_SIZE,
-    HOME_RADIUS_M,
     POSE_SIZE,
     epm_to_pose,
-    frame_direction,
     home_pose,
-    place_epm,
     pose_bounds,
     pose_to_epm,
     project_epms,
@@ -39,83 +35,14 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 ActionMode = Literal["home", "pose", "step", "wrench"]
 
-HOME_ANGLE_RAD = 1.2
-"""Largest offset of an angle in ``home``."""
-HOME_RADIUS_OUT_M = 0.15
-"""Largest offset of a radius outwards in ``home``; inwards it reaches r_min."""
 STEP_ANGLE_RAD = 0.3
 STEP_RADIUS_M = 0.05
 WRENCH_FORCE_N = 0.020
 WRENCH_TORQUE_NM = 0.001
 
-_BLOCK = 64  # rows whose angles are vectorised together
 _FALLBACK_STARTS = 4
 _TOLERANCE = 1e-6
 _MAX_ITERATIONS = 60
-
-
-@law
-def _turn(epms: Floats, c: float, s: float) -> None:
-    """Turn EPMs (N, 6) about the vertical by the angle with cosine c and sine s."""
-    for k in range(len(epms)):
-        e = epms[k]
-        e[0], e[1] = c * e[0] - s * e[1], s * e[0] + c * e[1]
-        e[3], e[4] = c * e[3] - s * e[4], s * e[3] + c * e[4]
-
-
-@kernel
-def _home_rows(
-    first: int,
-    last: int,
-    active: Bools,
-    actions: Floats,
-    measured: Floats,
-    home: Floats,
-    limits: Floats,
-    targets: Floats,
-    projected: Bools,
-) -> None:
-    n_epm = targets.shape[1]
-    each = 2 + 4 * n_epm  # angles of a row: both headings, four of each EPM
-    angles, s, c = np.empty(_BLOCK * each), np.empty(_BLOCK * each), np.empty(_BLOCK * each)
-    for start in range(first, last, _BLOCK):
-        end, count = min(start + _BLOCK, last), 0
-        for i in range(start, end):
-            if active[i]:
-                angles[count], angles[count + 1] = measured[i, 0, 2], measured[i, 1, 2]
-                count += 2
-                for at in range(0, POSE_SIZE * n_epm, POSE_SIZE):
-                    for j in (0, 1, 3, 4):
-                        angles[count] = home[at + j] + HOME_ANGLE_RAD * actions[i, at + j]
-                        count += 1
-        sincos_all(angles, count, s, c)
-        at = 0
-        for i in range(start, end):
-            if active[i]:
-                frame_c, frame_s = frame_direction(s[at], c[at], s[at + 1], c[at + 1])
-                at += 2
-                for k in range(n_epm):
-                    a = actions[i, POSE_SIZE * k + 2]
-                    radius = home[POSE_SIZE * k + 2] + a * (HOME_RADIUS_OUT_M if a > 0.0 else HOME_RADIUS_M - limits[0])
-                    epm = targets[i, k]
-                    place_epm(
-                        radius, s[at], c[at], s[at + 1], c[at + 1], s[at + 2], c[at + 2], s[at + 3], c[at + 3], epm
-                    )
-                    at += 4
-                _turn(targets[i], frame_c, frame_s)
-                projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
-
-
-@kernel
-def _start_rows(mask: Bools, measured: Floats, home_epms: Floats, limits: Floats, epms: Floats) -> None:
-    for i in range(len(mask)):
-        if mask[i]:
-            s1, c1 = sincos(measured[i, 0, 2])
-            s2, c2 = sincos(measured[i, 1, 2])
-            frame_c, frame_s = frame_direction(s1, c1, s2, c2)
-            epms[i] = home_epms
-            _turn(epms[i], frame_c, frame_s)
-            project_epms(epms[i], limits[0], limits[1], limits[2])
 
 
 @kernel
@@ -250,9 +177,7 @@ class Actions:
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
         self._home = home_pose(system.n_epm)
-        self._home_epms = np.empty((system.n_epm, EPM_SIZE))
-        for epm, (a, e, radius, b, f) in zip(self._home_epms, self._home.reshape(-1, POSE_SIZE), strict=True):
-            place_epm(radius, *sincos(a), *sincos(e), *sincos(b), *sincos(f), epm)
+        self._home_epms = home_epms(system.n_epm)
         self._low, self._high = pose_bounds(system)
         # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))
@@ -267,7 +192,7 @@ class Actions:
 
     def start(self, mask: Bools, measured: Floats, epms: Floats) -> None:
         """Put the EPMs (n, N, 6) at home where ``mask`` says, for robots measured at (n, 2, 3)."""
-        _start_rows(mask, measured, self._home_epms, self._limits, epms)
+        self._workers.run(start_rows, len(mask), mask, measured, self._home_epms, self._limits, epms)
 
     def to_epms(
         self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None
@@ -289,7 +214,7 @@ class Actions:
         n, run = len(epms), self._workers.run
         targets, projected = np.empty(epms.shape), np.empty(n, np.bool_)
         if self.mode == "home":
-            run(_home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
+            run(home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
         elif self.mode == "pose":
             run(_pose_rows, n, active, actions, self._low, self._high, self._limits, targets, projected)
         elif self.mode == "step":

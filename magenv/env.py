@@ -130,7 +130,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward, terminated, truncated = self._episodes.step(
             check_action(action, (self._episodes.actions.size,))[None], _ACTIVE
         )
-        info = _single(self._episodes.state_info() | self._episodes.step_info())
+        info = self._episodes.single_info()
         ended = bool(terminated[0] or truncated[0])
         if ended:
             self._running = False

@@ -12,29 +12,20 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
 from magenv.kernels import kernel
 from magenv.params import PLANTS, System, TaskParams, choose, require
-from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_rows
-from magenv.trajectories import (
-    draw_keys,
-    draw_rows,
-    named_trajectory,
-    random_limits,
-    reference_kernel,
-    trajectory_of,
-)
+from magenv.starts import Starts
+from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_terms
+from magenv.trajectories import named_trajectory, trajectory_of
 from magenv.workers import Workers
-from magenv.world import World
+from magenv.world import World, time_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_AHEAD = 32
-"""Episodes for which a row draws at a time, whatever the size of the batch: it is part of what a seed means."""
 _TERMS = tuple(f"reward_{name}" for name in REWARD_TERMS)
 
 
@@ -82,46 +73,19 @@ def _clip(numbers: Floats) -> bool:
 
 
 @kernel
-def _place_rows(
-    mask: Bools,
-    offsets: Floats,
-    used: NDArray[np.int64],
-    position_sd: float,
-    heading_sd: float,
-    coefficients: Floats,
-    duration: Floats,
-    robots: Floats,
-    measured: Floats,
-    before: Floats,
-    projected: Bools,
-) -> None:
-    """Put the robots at rest near the start of their references where ``mask`` says, by their next offsets."""
-    for i in range(len(mask)):
-        if mask[i]:
-            which = trajectory_of(i, len(duration))
-            reference_kernel(coefficients[which], duration[which], 0.0, measured[i])
-            offset = offsets[i, used[i]]
-            used[i] += 1
-            for robot in range(2):
-                measured[i, robot, 0] += position_sd * offset[2 * robot]
-                measured[i, robot, 1] += position_sd * offset[2 * robot + 1]
-                measured[i, robot, 2] += heading_sd * offset[4 + robot]
-                for j in range(3):
-                    robots[i, robot, j], robots[i, robot, 3 + j] = measured[i, robot, j], 0.0
-                    before[i, robot, j] = measured[i, robot, j]
-            projected[i] = False
-
-
-@kernel
 def _settle_rows(
+    first: int,
+    last: int,
     active: Bools,
     robots: Floats,
     commanded: Bools,
+    numbers: Floats,
     counts: NDArray[np.int64],
-    terms: Floats,
-    time: Floats,
+    step: NDArray[np.int64],
     duration: Floats,
     period: float,
+    substeps: int,
+    terms: Floats,
     measured: Floats,
     before: Floats,
     projected: Bools,
@@ -130,7 +94,7 @@ def _settle_rows(
     truncated: Bools,
 ) -> None:
     """Measure the robots after a hold; write what it paid and how it ended. Inactive rows: nothing, not ended."""
-    for i in range(len(active)):
+    for i in range(first, last):
         reward[i], terminated[i], truncated[i] = 0.0, False, False
         if active[i]:
             for robot in range(2):
@@ -138,9 +102,11 @@ def _settle_rows(
                     before[i, robot, j] = measured[i, robot, j]
                     measured[i, robot, j] = robots[i, robot, j]
             projected[i] = commanded[i]
+            terms[0, i], terms[1, i] = reward_terms(numbers[0, i], numbers[1, i])
             reward[i] = 0.5 * (terms[0, i] + terms[1, i])
             terminated[i] = counts[1, i] > 0
-            over = time[i] >= duration[trajectory_of(i, len(duration))] - 1e-9 * period
+            time = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
+            over = time >= duration[trajectory_of(i, len(duration))] - 1e-9 * period
             truncated[i] = over and not terminated[i]
 
 
@@ -178,49 +144,18 @@ class Episodes:
         self._before: Floats = np.zeros((n, 2, 3))
         self._terms: Floats = np.zeros((len(REWARD_TERMS), n))
         self._projected: Bools = np.zeros(n, np.bool_)
-        self._rngs: list[np.random.Generator | None] = [None] * n
-        self._used: NDArray[np.int64] = np.full(n, _AHEAD)
-        self._offsets: Floats = np.zeros((n, _AHEAD, 6))
-        self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if trajectory is None else 0), np.uint64)
+        self._starts = Starts(n, trajectory is None, self.task, self._workers)
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Draw the episodes of ``row`` from ``rng`` from now on."""
-        self._rngs[row] = rng
-        self._used[row] = _AHEAD
+        self._starts.seed(row, rng)
 
     def start(self, mask: Bools) -> None:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator."""
-        w = self.world
-        for row in np.flatnonzero(mask & (self._used == _AHEAD)).tolist():
-            self._draw_ahead(row)
-        if self.settings.scenario == "random":
-            keys = self._keys[np.arange(len(mask)), np.minimum(self._used, _AHEAD - 1)]
-            self._workers.run(draw_rows, len(mask), mask, keys, *random_limits(), w.coefficients, w.duration_s)
-        _place_rows(
-            mask,
-            self._offsets,
-            self._used,
-            self.task.start_position_sd_m,
-            self.task.start_heading_sd_rad,
-            w.coefficients,
-            w.duration_s,
-            w.robots,
-            self._measured,
-            self._before,
-            self._projected,
-        )
-        self.actions.start(mask, self._measured, w.epms)
-        w.begin(mask)
-
-    def _draw_ahead(self, row: int) -> None:
-        """Draw what the next episodes of ``row`` need, many at a time: one draw costs as much as many."""
-        rng = self._rngs[row]
-        if rng is None:
-            rng = self._rngs[row] = seeding.np_random(None)[0]
-        if self._keys.size:
-            self._keys[row] = draw_keys(rng, _AHEAD)
-        self._offsets[row] = rng.standard_normal((_AHEAD, 6))
-        self._used[row] = 0
+        self._starts.place(mask, self.world, self._measured, self._before)
+        self._projected[mask] = False
+        self.actions.start(mask, self._measured, self.world.epms)
+        self.world.begin(mask)
 
     def observe(self) -> NDArray[np.float32]:
         """Return the observations (n, d), newly allocated."""
@@ -248,17 +183,20 @@ class Episodes:
         w, n = self.world, len(active)
         targets, commanded = self.actions.to_epms(actions, self._measured, w.epms, active)
         m = w.step(targets, active)
-        reward_rows(m.position_error_m, m.heading_error_rad, self._terms)
         reward, terminated, truncated = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)
-        _settle_rows(
+        self._workers.run(
+            _settle_rows,
+            n,
             active,
             w.robots,
             commanded,
+            m.numbers,
             m.counts,
-            self._terms,
-            w.time_s(),
+            w.step_count,
             w.duration_s,
             w.period_s,
+            w.substeps,
+            self._terms,
             self._measured,
             self._before,
             self._projected,
@@ -272,6 +210,21 @@ class Episodes:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""
         time, references, poses = self.world.describe()
         return {"time_s": time, "robots": self.world.robots.copy(), "reference": references, "epm_pose": poses}
+
+    def single_info(self) -> dict[str, Any]:
+        """Return ``state_info`` and ``step_info`` of a single episode, its numbers as Python's."""
+        m, (time, references, poses) = self.world.measurements, self.world.describe()
+        info: dict[str, Any] = {
+            "time_s": time.item(),
+            "robots": self.world.robots[0].copy(),
+            "reference": references[0],
+            "epm_pose": poses[0],
+        }
+        info.update(zip(m.NUMBERS, m.numbers.ravel().tolist(), strict=True))
+        info.update(zip(m.COUNTS, m.counts.ravel().tolist(), strict=True))
+        info.update(zip(_TERMS, self._terms.ravel().tolist(), strict=True))
+        info["projected"] = self._projected.item()
+        return info
 
     def step_info(self) -> dict[str, NDArray[Any]]:
         """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated."""

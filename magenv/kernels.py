@@ -13,6 +13,10 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+_CONSTANTS = ("params", "kernels", "lanes")
+"""Modules without kernels of which the machine code depends."""
+
+
 def _cache_dir() -> Path:
     """Return a cache folder named after the content of all sources.
 
@@ -23,7 +27,7 @@ def _cache_dir() -> Path:
     digest = hashlib.sha256()
     for source in sorted(package.glob("*.py")):
         text = source.read_bytes()
-        if b"@kernel" in text or b"@law" in text or source.name == "params.py":  # params holds the constants
+        if b"@kernel" in text or b"@law" in text or source.stem in _CONSTANTS:
             digest.update(source.name.encode() + b"\0" + text)
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or package / "__pycache__")
     if not os.access(package, os.W_OK) and "NUMBA_CACHE_DIR" not in os.environ:

@@ -255,9 +255,7 @@ def _closeness(error: float, near: float, middle: float, far: float) -> float:
     return close if error < math.inf else 0.0  # NaN: the state was lost, nothing is paid
 
 
-@kernel
-def reward_rows(position_error: Floats, heading_error: Floats, terms: Floats) -> None:
-    """Write the reward terms (2, n), each in [0, 1], of mean errors (n,) over the hold in m and rad."""
-    for i in range(terms.shape[1]):
-        terms[0, i] = _closeness(position_error[i], *POSITION_SCALES_M)
-        terms[1, i] = _closeness(heading_error[i], *HEADING_SCALES_RAD)
+@law
+def reward_terms(position_error: float, heading_error: float) -> tuple[float, float]:
+    """Return the reward terms, each in [0, 1], of the mean errors over a hold in m and rad."""
+    return _closeness(position_error, *POSITION_SCALES_M), _closeness(heading_error, *HEADING_SCALES_RAD)

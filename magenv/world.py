@@ -75,6 +75,8 @@ class Measurements:
 
 @kernel
 def _begin_rows(
+    first: int,
+    last: int,
     mask: Bools,
     robots: Floats,
     coefficients: Floats,
@@ -85,29 +87,23 @@ def _begin_rows(
     counts: Integers,
 ) -> None:
     reference = np.empty((2, 3))
-    for i in range(len(mask)):
+    for i in range(first, last):
         if mask[i]:
-            step[i], counts[1, i] = 0, 0
+            step[i] = 0
+            counts[1, i] = 0
             which = trajectory_of(i, len(duration))
             reference_kernel(coefficients[which], duration[which], 0.0, reference)
-            first = math.hypot(robots[i, 0, 0] - reference[0, 0], robots[i, 0, 1] - reference[0, 1])
-            second = math.hypot(robots[i, 1, 0] - reference[1, 0], robots[i, 1, 1] - reference[1, 1])
+            away1 = math.hypot(robots[i, 0, 0] - reference[0, 0], robots[i, 0, 1] - reference[0, 1])
+            away2 = math.hypot(robots[i, 1, 0] - reference[1, 0], robots[i, 1, 1] - reference[1, 1])
             apart = math.hypot(robots[i, 1, 0] - robots[i, 0, 0], robots[i, 1, 1] - robots[i, 0, 1])
-            numbers[5, i] = apart if max(first, second) <= tracking_distance else math.nan
+            numbers[5, i] = apart if max(away1, away2) <= tracking_distance else math.nan
 
 
 @law
 def time_of(step: int, substeps_done: int, loss: int, period: float, substeps: int) -> float:
     """Return the time (s) of a row: the control instant, or the substep at which control was lost."""
-    if loss > 0:
-        return (step - 1) * period + substeps_done * (period / substeps)
-    return step * period
-
-
-@kernel
-def _time_rows(step: Integers, counts: Integers, period: float, substeps: int, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
+    lost = (step - 1) * period + substeps_done * (period / substeps)
+    return lost if loss > 0 else step * period
 
 
 @kernel
@@ -116,13 +112,18 @@ def _describe_rows(
     last: int,
     coefficients: Floats,
     duration: Floats,
-    time: Floats,
+    step: Integers,
+    counts: Integers,
+    period: float,
+    substeps: int,
     epms: Floats,
+    time: Floats,
     references: Floats,
     poses: Floats,
 ) -> None:
     for i in range(first, last):
         which = trajectory_of(i, len(duration))
+        time[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
         reference_kernel(coefficients[which], duration[which], time[i], references[i])
     n_epm = epms.shape[1]
     epms_to_poses(epms.reshape(-1, EPM_SIZE), first * n_epm, last * n_epm, poses.reshape(-1, POSE_SIZE))
@@ -194,7 +195,9 @@ class World:
     def begin(self, mask: Bools) -> None:
         """Begin episodes where ``mask`` says, with the states, EPMs and trajectories that the rows hold."""
         m = self.measurements
-        _begin_rows(
+        self._workers.run(
+            _begin_rows,
+            len(mask),
             mask,
             self.robots,
             self.coefficients,
@@ -243,13 +246,24 @@ class World:
 
     def time_s(self) -> Floats:
         """Return the time (n,) in s: the control instant, or the substep at which control was lost."""
-        out = np.empty(len(self.robots))
-        _time_rows(self.step_count, self.measurements.counts, self.period_s, self.substeps, out)
-        return out
+        return self.describe()[0]
 
     def describe(self) -> tuple[Floats, Floats, Floats]:
         """Return times (n,), references (n, 2, 3) at these times and the EPMs' pose vectors (n, 5 N)."""
         n, n_epm = self.epms.shape[:2]
-        time, references, poses = self.time_s(), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
-        self._workers.run(_describe_rows, n, self.coefficients, self.duration_s, time, self.epms, references, poses)
+        time, references, poses = np.empty(n), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
+        self._workers.run(
+            _describe_rows,
+            n,
+            self.coefficients,
+            self.duration_s,
+            self.step_count,
+            self.measurements.counts,
+            self.period_s,
+            self.substeps,
+            self.epms,
+            time,
+            references,
+            poses,
+        )
         return time, references, poses

@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from magenv.actions import (
-    HOME_ANGLE_RAD,
-    HOME_RADIUS_OUT_M,
     STEP_ANGLE_RAD,
     STEP_RADIUS_M,
     WRENCH_FORCE_N,
@@ -24,6 +22,7 @@ from magenv.actions import (
     pose_to_action,
 )
 from magenv.allocation import allocate
+from magenv.home import HOME_ANGLE_RAD, HOME_RADIUS_OUT_M
 from magenv.params import System
 from magenv.poses import from_cartesian, home_pose, pose_bounds, project, robots_frame, to_cartesian
 from magenv.wrench import planar_moments, robot_wrench

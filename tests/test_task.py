@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode
 from magenv.env import TwoRobots
 from magenv.episodes import Episodes, Settings
-from magenv.task import HEADING_SCALES_RAD, POSITION_SCALES_M, Frame, ObservationMode, reward_rows, unpack
+from magenv.task import HEADING_SCALES_RAD, POSITION_SCALES_M, Frame, ObservationMode, reward_terms, unpack
 from magenv.trajectories import draw
 
 Floats = NDArray[np.float64]
@@ -222,8 +222,7 @@ def test_observations_stay_within_the_space_under_extreme_actions(
 
 def test_reward_terms_fall_from_one_to_zero() -> None:
     error = np.array([0.0, *np.geomspace(1e-5, 1e3, 60)])
-    terms = np.empty((2, 61))
-    reward_rows(error, error, terms)
+    terms = np.array([reward_terms(e, e) for e in error]).T
     for term, scales in zip(terms, (POSITION_SCALES_M, HEADING_SCALES_RAD), strict=True):
         assert term[0] == 1.0
         assert (np.diff(term) < 0).all()

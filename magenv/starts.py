@@ -1,0 +1,105 @@
+"""Where episodes begin: trajectories and start offsets, drawn from each row's own generator before anything moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from magenv.kernels import kernel
+from magenv.params import TaskParams
+from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_kernel, trajectory_of
+from magenv.workers import Workers
+from magenv.world import World
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_AHEAD = 32
+"""Episodes for which a row draws at a time, whatever the size of the batch: it is part of what a seed means."""
+
+
+@kernel
+def _place_rows(
+    first: int,
+    last: int,
+    mask: Bools,
+    offsets: Floats,
+    used: NDArray[np.int64],
+    position_sd: float,
+    heading_sd: float,
+    coefficients: Floats,
+    duration: Floats,
+    robots: Floats,
+    measured: Floats,
+    before: Floats,
+) -> None:
+    """Put the robots at rest near the start of their references where ``mask`` says, by their next offsets."""
+    for i in range(first, last):
+        if mask[i]:
+            which = trajectory_of(i, len(duration))
+            reference_kernel(coefficients[which], duration[which], 0.0, measured[i])
+            offset = offsets[i, used[i]]
+            used[i] += 1
+            for robot in range(2):
+                measured[i, robot, 0] += position_sd * offset[2 * robot]
+                measured[i, robot, 1] += position_sd * offset[2 * robot + 1]
+                measured[i, robot, 2] += heading_sd * offset[4 + robot]
+                for j in range(3):
+                    robots[i, robot, j], robots[i, robot, 3 + j] = measured[i, robot, j], 0.0
+                    before[i, robot, j] = measured[i, robot, j]
+
+
+class Starts:
+    """The beginnings of ``n`` rows' episodes, one after another along each row's generator.
+
+    They are drawn many at a time, since a call of a generator costs as much as its numbers.
+    """
+
+    def __init__(self, n: int, random: bool, task: TaskParams, workers: Workers) -> None:
+        self._random = random
+        self._task = task
+        self._workers = workers
+        self._rngs: list[np.random.Generator | None] = [None] * n
+        self._used: NDArray[np.int64] = np.full(n, _AHEAD)
+        self._offsets: Floats = np.zeros((n, _AHEAD, 6))
+        self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if random else 0), np.uint64)
+
+    def seed(self, row: int, rng: np.random.Generator) -> None:
+        """Draw the episodes of ``row`` from ``rng`` from now on."""
+        self._rngs[row] = rng
+        self._used[row] = _AHEAD
+
+    def _draw_ahead(self, row: int) -> None:
+        rng = self._rngs[row]
+        if rng is None:
+            rng = self._rngs[row] = seeding.np_random(None)[0]
+        if self._random:
+            self._keys[row] = draw_keys(rng, _AHEAD)
+        self._offsets[row] = rng.standard_normal((_AHEAD, 6))
+        self._used[row] = 0
+
+    def place(self, mask: Bools, world: World, measured: Floats, before: Floats) -> None:
+        """Put the robots at the start of their next episodes where ``mask`` says, at rest.
+
+        Their poses also go to ``measured`` and ``before`` (n, 2, 3).
+        """
+        for row in np.flatnonzero(mask & (self._used == _AHEAD)).tolist():
+            self._draw_ahead(row)
+        if self._random:
+            keys = self._keys[np.arange(len(mask)), np.minimum(self._used, _AHEAD - 1)]
+            self._workers.run(draw_rows, len(mask), mask, keys, *random_limits(), world.coefficients, world.duration_s)
+        self._workers.run(
+            _place_rows,
+            len(mask),
+            mask,
+            self._offsets,
+            self._used,
+            self._task.start_position_sd_m,
+            self._task.start_heading_sd_rad,
+            world.coefficients,
+            world.duration_s,
+            world.robots,
+            measured,
+            before,
+        )
