@@ -192,7 +192,7 @@ class Actions:
 
     def start(self, mask: Bools, measured: Floats, epms: Floats) -> None:
         """Put the EPMs (n, N, 6) at home where ``mask`` says, for robots measured at (n, 2, 3)."""
-        self._workers.run(start_rows, len(mask), mask, measured, self._home_epms, self._limits, epms)
+        self._workers.run(start_rows, len(mask), mask, measured, self._home_epms, epms)
 
     def to_epms(
         self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None

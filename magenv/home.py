@@ -81,9 +81,7 @@ def home_rows(
 
 
 @kernel
-def start_rows(
-    first: int, last: int, mask: Bools, measured: Floats, home: Floats, limits: Floats, epms: Floats
-) -> None:
+def start_rows(first: int, last: int, mask: Bools, measured: Floats, home: Floats, epms: Floats) -> None:
     """Put the EPMs (n, N, 6) at ``home`` (N, 6) in the robots' frame where ``mask`` says."""
     for i in range(first, last):
         if mask[i]:
@@ -92,4 +90,3 @@ def start_rows(
             frame_c, frame_s = frame_direction(s1, c1, s2, c2)
             epms[i] = home
             _turn(epms[i], frame_c, frame_s)
-            project_epms(epms[i], limits[0], limits[1], limits[2])

@@ -76,7 +76,7 @@ class Starts:
             rng = self._rngs[row] = seeding.np_random(None)[0]
         if self._random:
             self._keys[row] = draw_keys(rng, _AHEAD)
-        self._offsets[row] = rng.standard_normal((_AHEAD, 6))
+        rng.standard_normal(out=self._offsets[row])
         self._used[row] = 0
 
     def place(self, mask: Bools, world: World, measured: Floats, before: Floats) -> None:
