@@ -115,6 +115,21 @@ def test_one_trajectory_is_kept_once() -> None:
     np.testing.assert_array_equal(one.numbers, two.numbers)
 
 
+def test_nan_in_a_lane_never_touches_its_neighbours() -> None:
+    """One poisoned row of many, lost at once; the others keep their bits through the steps that follow."""
+    sick, well = (TwoRobotsVector(N, scenario="approach-60", control_hz=20.0) for _ in range(2))
+    sick.reset(seed=0)
+    well.reset(seed=0)
+    sick._episodes.world.robots[7, 0, 3] = np.nan
+    others = np.arange(N) != 7
+    for step in range(6):
+        command = np.stack([actions(row, step, 10) for row in range(N)])
+        a, b = sick.step(command)[:4], well.step(command)[:4]
+        assert all(one[others].tobytes() == two[others].tobytes() for one, two in zip(a, b, strict=True))
+        assert np.isfinite(a[0]).all()
+        assert step > 0 or a[2][7]
+
+
 # Machine code
 
 
