@@ -89,7 +89,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         render_mode: str | None = None,
     ) -> None:
         modes = self.metadata["render_modes"]
-        require(render_mode in (None, *modes), "render_mode", "None, " + ", ".join(modes), render_mode)
+        require(render_mode in (None, *modes), "render_mode", "one of None, " + ", ".join(modes), render_mode)
         self.render_mode = render_mode
         self._episodes = Episodes(1, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
         self.layout = self._episodes.layout

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
-from magenv.params import PLANTS, System, TaskParams, choose, require
+from magenv.params import PLANTS, InputError, System, TaskParams, choose, require
 from magenv.poses import from_cartesian
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_rows
 from magenv.trajectories import check_scenario, draw
@@ -49,7 +49,7 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
     try:
         numbers = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"Input action must be {must_be}; instead received {action!r}.") from None
+        raise InputError(f"Input action must be {must_be}; instead received {action!r}.") from None
     require(numbers.shape == shape, "action", must_be, numbers.shape)
     require(bool(np.isfinite(numbers).all()), "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
     return np.clip(numbers, -1.0, 1.0)

@@ -13,10 +13,14 @@ MU_0 = 4e-7 * math.pi
 """Vacuum permeability in H/m, the value of the paper."""
 
 
+class InputError(ValueError):
+    """What was passed in is not what it must be: the user's to mend, unlike any other ``ValueError``."""
+
+
 def require(condition: bool, name: str, must_be: str, received: object) -> None:
-    """Raise ``ValueError`` in the one form used for all bad input of this package."""
+    """Raise ``InputError`` in the one form used for all bad input of this package."""
     if not condition:
-        raise ValueError(f"Input {name} must be {must_be}; instead received {received!r}.")
+        raise InputError(f"Input {name} must be {must_be}; instead received {received!r}.")
 
 
 def _require_positive(**values: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -152,6 +153,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one RGB array (h, w, 3) per episode."""
         if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='rgb_array' given to gymnasium.make_vec.")
             return None
         if not self._renderers:
             for _ in range(self.num_envs):

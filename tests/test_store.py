@@ -21,9 +21,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.catalogue import controller, names
+from agents.checkpoints import save_model, stored_config
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import Learned
-from agents.learning import build, resumed, save_model
+from agents.learning import build
 from agents.store import (
     CARD,
     FORMAT,
@@ -255,7 +256,7 @@ def test_a_doctored_file_is_refused_and_runs_nothing(folder: Path, tmp_path: Pat
         one_line(lambda: Learned(folder))
         one_line(lambda: controller(str(folder)))
     if name == CARD:
-        one_line(lambda: resumed(TrainConfig(resume=tmp_path)))
+        one_line(lambda: stored_config(tmp_path))
     assert not canary.exists()
 
 
