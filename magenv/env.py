@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
-from magenv.render import RENDER_FPS, Renderer, scene_of
+from magenv.render import RENDER_FPS, Renderer
+from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
 
 _ACTIVE = np.ones(1, np.bool_)
