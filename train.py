@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import shlex
+import signal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends the process without a word
 
 from agents.catalogue import controller
 from agents.checkpoints import stored_config
@@ -25,7 +28,8 @@ def main() -> None:
         config = parse(TrainConfig, stored_config(config.resume))
     folder, finished = train(config, command_line())
     if not finished:
-        print(f"Stopped early; model: {folder / 'model'}, to go on: python train.py --resume {folder}")
+        again = f"python train.py --resume {shlex.quote(str(folder))}"
+        print(f"Stopped early; model: {folder / 'model'}, to go on: {again}")
         raise KeyboardInterrupt
     agent = Learned(folder / "model")
     s = agent.settings

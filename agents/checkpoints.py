@@ -34,6 +34,7 @@ GOING_ON = ("steps", "out", "resume", "checkpoint_every")
 def _training_state(model: BaseAlgorithm, algo: str) -> dict[str, Any]:
     """Return all that a continued training needs beside the policy, as nested dictionaries."""
     state: dict[str, Any] = {name: _attribute(model, name).state_dict() for name in _OPTIMISERS[algo]}
+    state["updates"] = _attribute(model, "_n_updates")
     if isinstance(model, SAC):
         assert model.log_ent_coef is not None
         state["log_ent_coef"] = model.log_ent_coef
@@ -82,6 +83,7 @@ def restore(folder: Path, model: BaseAlgorithm, env: VecNormalize, algo: str) ->
     if isinstance(model, SAC):
         assert model.log_ent_coef is not None
         model.log_ent_coef.data.copy_(unflatten_like(model.log_ent_coef, flat, "log_ent_coef"))
+    model._n_updates = unflatten_like(0, flat, "updates")
     statistics: Any = env.obs_rms
     shape = statistics.mean.shape
     require(normalisation.mean.shape == shape, "checkpoint", f"statistics of shape {shape}", normalisation.mean.shape)

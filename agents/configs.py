@@ -18,7 +18,7 @@ _WIDTH_MAX, _DEPTH_MAX = 4096, 8
 
 def check_net(net: tuple[int, ...]) -> None:
     """Raise ``InputError`` unless ``net`` is a sensible sequence of layer widths."""
-    fits = 1 <= len(net) <= _DEPTH_MAX and all(isinstance(w, int) and 1 <= w <= _WIDTH_MAX for w in net)
+    fits = 1 <= len(net) <= _DEPTH_MAX and all(type(w) is int and 1 <= w <= _WIDTH_MAX for w in net)
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
 
 

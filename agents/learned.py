@@ -71,6 +71,11 @@ class Learned:
             f"statistics of shape {size}",
             statistics.mean.shape,
         )
+        try:
+            finite = bool(np.isfinite(self.predict(np.zeros(size, np.float32))[0]).all())
+        except ValueError:  # torch refuses to make a distribution of NaN
+            finite = False
+        require(finite, "model", "weights that give finite actions", str(folder))
 
     def seed(self, seed: int) -> None:
         """Do nothing: the policy's mode has no randomness."""

@@ -28,6 +28,8 @@ from agents.store import check_replaceable
 from magenv.params import require
 
 DEFAULT_FOLDER = Path("runs/train")
+_MARK = "run"
+"""Empty file that makes a folder a run's, from before the first checkpoint on."""
 
 
 def _falling(start: float) -> Any:
@@ -92,8 +94,16 @@ class _Refill(BaseCallback):
         return True
 
 
-def _holds_a_run(folder: Path) -> bool:
-    return any((folder / name).exists() for name in ("checkpoints", "model"))
+def _claim(folder: Path) -> bool:
+    """Make the folder that of a new run; return False where it is another run's, begun even at this very moment."""
+    check_output_dir(folder)
+    if any((folder / name).exists() for name in ("checkpoints", "model")):
+        return False
+    try:
+        (folder / _MARK).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
 def _new_run(config: TrainConfig) -> TrainConfig:
@@ -102,15 +112,14 @@ def _new_run(config: TrainConfig) -> TrainConfig:
     Raises
     ------
     InputError
-        If ``out`` holds a run.
+        If ``out`` holds a run or cannot be written.
     """
     if config.out is not None:
-        free = not _holds_a_run(config.out)
+        free = _claim(config.out)
         require(free, "out", "a folder without a run (to go on with one: resume)", str(config.out))
         return config
     names = (DEFAULT_FOLDER.with_name(f"{DEFAULT_FOLDER.name}-{k}") for k in itertools.count(2))
-    free_names = (folder for folder in itertools.chain([DEFAULT_FOLDER], names) if not _holds_a_run(folder))
-    return dataclasses.replace(config, out=next(free_names))
+    return dataclasses.replace(config, out=next(filter(_claim, itertools.chain([DEFAULT_FOLDER], names))))
 
 
 def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
@@ -134,27 +143,30 @@ def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
     """
     torch.set_num_threads(1)  # two threads on two cores spin: ten times slower
     start = check_goes_on(config) if config.resume is not None else None
-    if config.resume is None or config.folder.resolve() != config.resume.resolve():
-        config = _new_run(config)
-    folder = config.folder
     model, env = build(config)
-    callbacks: list[BaseCallback] = [progress := Reporter(model, config, env, command)]
     if start is not None:
         restore(start, model, env, config.algo)
         # Not the first run's episodes again.
         env.seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
-        if isinstance(model, SAC):
-            callbacks.append(_Refill(config.sac))
+    new = config.resume is None or config.folder.resolve() != config.resume.resolve()
+    if new:
+        config = _new_run(config)
+    folder = config.folder
     check_output_dir(folder)
     check_replaceable(folder / "model")
     begun, finished = model.num_timesteps, True
-    model.set_logger(logger(config))
+    model.set_logger(logger(config, begun))
+    callbacks: list[BaseCallback] = [progress := Reporter(model, config, env, command)]
+    if start is not None and isinstance(model, SAC):
+        callbacks.append(_Refill(config.sac))
     try:
         interval = 1 if config.algo == "ppo" else 50
         model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
     except KeyboardInterrupt:
         finished = False
         if model.num_timesteps == begun:
+            if new:
+                (folder / _MARK).unlink()  # nothing to go on with: the folder is free again
             raise
     finally:
         progress.close()

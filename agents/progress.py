@@ -79,7 +79,7 @@ class Reporter(BaseCallback):
         save_model(folder, self.model, self._env, self._config, True, self._command)
         kept = checkpoints(self._config.folder)[-KEPT_CHECKPOINTS:]
         for other in folder.parent.iterdir():
-            if other.name.startswith("step-") and other not in kept:
+            if other.is_dir() and other.name.startswith("step-") and other not in kept:
                 shutil.rmtree(other)
 
     def close(self) -> None:
@@ -91,19 +91,30 @@ class Reporter(BaseCallback):
         self.logger.close()
 
 
-def logger(config: TrainConfig) -> Logger:
-    """Return the logger of a run; what stood in the progress.csv of the run gone on with stands first in its own."""
+def logger(config: TrainConfig, begun: int) -> Logger:
+    """Return the logger of a run, begun at a step count.
+
+    What stood in the progress.csv of the run gone on with, up to there, stands first in its own.
+    """
     past = config.resume / "progress.csv" if config.resume is not None else None
     rows: list[dict[str, Any]] = []
     if past is not None and past.is_file():
         with past.open(newline="") as file:
-            rows = [{key: _number(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+            whole = [row for row in csv.DictReader(file) if None not in row]  # None: what is beyond the columns
+        read = [{key: _number(value) for key, value in row.items() if value} for row in whole]
+        rows = [row for row in read if _steps(row) <= begun]  # what came after the checkpoint is trained anew
     logger = configure(str(config.folder), _log_formats())
     for output in logger.output_formats:
         if isinstance(output, CSVOutputFormat):
             for row in rows:
                 output.write(row, dict.fromkeys(row, ()))
     return logger
+
+
+def _steps(row: dict[str, Any]) -> float:
+    """Return a row's step count; that of a damaged row is infinite."""
+    steps = row.get("time/total_timesteps")
+    return steps if isinstance(steps, (int, float)) else math.inf
 
 
 def _number(text: str) -> str | float | int:

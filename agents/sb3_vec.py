@@ -49,9 +49,8 @@ class TwoRobotsVecEnv(VecEnv):
         """Step all episodes."""
         observations, rewards, terminated, truncated, info = self._env.step(self._actions)
         dones = terminated | truncated
-        last = info.get("final_info", {})
         for key in EPISODE_KEYS:
-            self._sums[key] += np.where(dones, last.get(key, 0.0), info[key])
+            self._sums[key] += info[key]
         self._sums["reward"] += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]

@@ -149,6 +149,9 @@ def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
     tensors = _load_tensors(Path(folder) / POLICY)
     for name in (_MEAN, _VARIANCE, _COUNT):
         require(name in tensors, "model", f"weights with {name}", str(Path(folder) / POLICY))
+    kinds = {name: torch.float64 if name in (_MEAN, _VARIANCE, _COUNT) else torch.float32 for name in tensors}
+    fits = all(value.dtype == kinds[name] for name, value in tensors.items())
+    require(fits, "model", "weights in float32 and statistics in float64", str(Path(folder) / POLICY))
     finite = all(bool(torch.isfinite(value).all()) for value in tensors.values())
     require(finite, "model", "finite weights", str(Path(folder) / POLICY))
     mean, variance, count = (tensors.pop(name).numpy().astype(np.float64) for name in (_MEAN, _VARIANCE, _COUNT))

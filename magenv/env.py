@@ -145,6 +145,10 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = Renderer(self._episodes.system, self._episodes.plant, self.render_mode == "human")
         return self._renderer.draw(scene_of(self._episodes.world, 0))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes over: all but the pictures, which it draws anew."""
+        return vars(self) | {"_renderer": None}
+
     def close(self) -> None:
         """Close the window; may be called again."""
         if self._renderer is not None:

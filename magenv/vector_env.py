@@ -162,6 +162,10 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         frames = [r.draw(scene_of(self._episodes.world, row)) for row, r in enumerate(self._renderers)]
         return tuple(frame for frame in frames if frame is not None)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes over: all but the pictures, which it draws anew."""
+        return vars(self) | {"_renderers": []}
+
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderers."""
         for renderer in self._renderers:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -460,6 +460,36 @@ def test_a_new_run_never_takes_the_folder_of_an_old_one(config: MakeConfig, tmp_
         with pytest.raises(ValueError, match=r"^Input out must be a folder without a run"):
             train(again)
     assert files_of(config().out) == before
+
+
+def test_two_runs_begun_at_once_have_folders_of_their_own(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    inner, original = [], PPO.learn
+
+    def learn(model: PPO, *arguments: Any, **options: Any) -> PPO:
+        if not inner:
+            inner.append(None)
+            inner[0] = train(config(steps=128, out=None))[0]
+        return original(model, *arguments, **options)
+
+    monkeypatch.setattr(PPO, "learn", learn)
+    outer, _ = train(config(steps=128, out=None, seed=1))
+    assert (outer, inner[0]) == (Path("runs/train"), Path("runs/train-2"))
+    assert [load_card(folder / "model").config["seed"] for folder in (outer, inner[0])] == [1, 0]
+
+
+def test_after_a_kill_progress_tells_only_what_counts(config: MakeConfig) -> None:
+    train(config())
+    shutil.rmtree(checkpoints(config().out)[-1])  # as if killed after the last rollout, before its checkpoint
+    log = config().out / "progress.csv"
+    log.write_text(
+        log.read_text() + "1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24\n"
+    )  # and half written
+    train(going_on(config().out))
+    steps = total_steps(rows_of(config().out))
+    assert steps == sorted(steps)
+    assert steps[-1] == 512
+    updates = [int(row["train/n_updates"]) for row in rows_of(config().out) if row["train/n_updates"]]
+    assert updates == sorted(updates)
 
 
 def test_default_folders_are_counted_up(config: MakeConfig) -> None:
