@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends the process without a word
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.catalogue import controller, names
+from agents.catalogue import controller, defaults, names
 from agents.command import command_line, friendly, parse
 from agents.comparison import compare
 
@@ -18,8 +21,8 @@ from agents.comparison import compare
 class EvaluateConfig:
     """Run controllers on the same episodes; write summary.json, the episodes' records, figures and animations."""
 
-    controllers: tuple[str, ...] = ("baseline", "tuned", "ppo")
-    """Names (see --list) or folders of trained models."""
+    controllers: tuple[str, ...] | None = None
+    """Names (see --list) or folders of trained models; by default baseline, tuned and the shipped agents that fit."""
     scenarios: tuple[str, ...] = ("approach-60", "approach-30")
     """approach-<s>, approach-<s>-anti with s in mm, or random."""
     plant: str = "paper"
@@ -44,7 +47,12 @@ def main() -> None:
     if c.list:
         print("\n".join(names()))
         return
-    chosen = [controller(name, c.n_epm, c.control_hz) for name in c.controllers]
+    if c.controllers is None:
+        chosen, unfit = defaults(c.n_epm, c.control_hz)
+        for reason in unfit:
+            print(f"left out: {reason}", file=sys.stderr)
+    else:
+        chosen = [controller(name, c.n_epm, c.control_hz) for name in c.controllers]
     compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, c.out, command_line())
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import shlex
+import signal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends the process without a word
 
 from agents.catalogue import controller
+from agents.checkpoints import stored_config
 from agents.command import command_line, friendly, parse
 from agents.comparison import compare
 from agents.configs import TrainConfig
@@ -20,14 +24,17 @@ SCENARIOS = ("approach-60", "approach-30")
 def main() -> None:
     """Train, evaluate, report."""
     config = parse(TrainConfig)
+    if config.resume is not None:  # what the command line leaves open is as in the run gone on with
+        config = parse(TrainConfig, stored_config(config.resume))
     folder, finished = train(config, command_line())
     if not finished:
-        print(f"Stopped early; model: {folder}, to go on: python train.py --resume {config.folder}")
+        again = f"python train.py --resume {shlex.quote(str(folder))}"
+        print(f"Stopped early; model: {folder / 'model'}, to go on: {again}")
         raise KeyboardInterrupt
-    agent = Learned(folder)
+    agent = Learned(folder / "model")
     s = agent.settings
     floor = [controller(name, s.n_epm, s.control_hz) for name in ("baseline", "idle", "random")]
-    compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, config.folder, command_line())
+    compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, folder, command_line())
 
 
 if __name__ == "__main__":

@@ -55,11 +55,12 @@ class Baseline:
         self._system = System(n_epm=n_epm)
         self._period_s = TaskParams(control_hz=control_hz).period_s
         self._layout = Layout(self._system, Plant().workspace_radius_m, self._period_s, self.observation, self.frame)
-        self._rng = np.random.default_rng(0)
+        self.seed(0)
 
     def seed(self, seed: int) -> None:
         """Fix the random starts to come."""
-        self._rng = np.random.default_rng(seed)
+        self._seeds = np.random.SeedSequence(seed)
+        self._rngs = [np.random.default_rng(self._seeds)]
 
     def predict(
         self,
@@ -77,11 +78,14 @@ class Baseline:
         elif episode_start is not None:
             state.restart(episode_start)
         desired = pid_wrench(parts.error, state, self._gains, self._period_s)
-        poses = np.stack([self._allocate(*row) for row in zip(desired, parts.robots, present, strict=True)])
+        missing = len(batch) - len(self._rngs)  # each row has random numbers of its own, whatever the others draw
+        self._rngs += [np.random.default_rng(child) for child in self._seeds.spawn(max(missing, 0))]
+        rows = zip(desired, parts.robots, present, self._rngs[: len(batch)], strict=True)
+        poses = np.stack([self._allocate(*row) for row in rows])
         actions = np.stack([pose_to_action(pose, self._system) for pose in poses])
         return actions.reshape(*np.shape(observation)[:-1], -1), state
 
-    def _allocate(self, desired: Floats, robots: Floats, present: Floats) -> Floats:
+    def _allocate(self, desired: Floats, robots: Floats, present: Floats, rng: np.random.Generator) -> Floats:
         """Return the poses for planar wrenches (2, 3) on robots (2, 3), out-of-plane components zero."""
         target = np.empty(WRENCH_SIZE)
         planar_target(desired.reshape(-1), robots[0, 2], robots[1, 2], target)
@@ -93,7 +97,7 @@ class Baseline:
             planar_moments(robots[:, 2], self._system.ipm_moment_am2),
             self._system,
             starts=STARTS,
-            seed=self._rng,
+            seed=rng,
             initial=present if self._warm_start else None,
             stop_early=self._warm_start,
         ).pose

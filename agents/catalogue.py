@@ -8,7 +8,7 @@ from agents.baseline import paper_baseline, tuned_baseline
 from agents.controller import Controller, Idle, Random
 from agents.learned import Learned
 from agents.store import CARD
-from magenv.params import require
+from magenv.params import InputError, require
 
 _SHIPPED = Path(__file__).parent / "data"
 _CLASSICAL = ("baseline", "tuned", "idle", "random")
@@ -17,6 +17,18 @@ _CLASSICAL = ("baseline", "tuned", "idle", "random")
 def names() -> list[str]:
     """Return the known names, shipped agents last."""
     return [*_CLASSICAL, *(folder.name for folder in sorted(_SHIPPED.glob("*")) if (folder / CARD).is_file())]
+
+
+def defaults(n_epm: int, control_hz: float) -> tuple[list[Controller], list[str]]:
+    """Return what is compared where no controllers are named, and which shipped agents do not fit the environment."""
+    chosen: list[Controller] = [paper_baseline(n_epm, control_hz), tuned_baseline(n_epm, control_hz)]
+    unfit = []
+    for name in names()[len(_CLASSICAL) :]:
+        try:
+            chosen.append(controller(name, n_epm, control_hz))
+        except InputError as error:
+            unfit.append(f"{name} ({error})")
+    return chosen, unfit
 
 
 def controller(name: str, n_epm: int = 2, control_hz: float = 2.0) -> Controller:

@@ -11,10 +11,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from agents.controller import Controller
 from agents.records import Record, check_output_dir
-from agents.report import print_table, write_report
+from agents.report import file_name, print_table, write_report
 from agents.rollout import run
 from magenv.episodes import Episodes, Settings
 from magenv.params import require
+
+SEED_MAX = 2**32 - 1
 
 
 def compare(
@@ -38,7 +40,8 @@ def compare(
         If an argument is unsound or ``out`` cannot be written; nothing has run then.
     """
     names = [controller.name for controller in controllers]
-    require(len(controllers) > 0 and len(set(names)) == len(names), "controllers", "one or more, each once", names)
+    distinct = len({file_name(name) for name in names}) == len(names)
+    require(len(controllers) > 0 and distinct, "controllers", "one or more, each once, of distinct file names", names)
     require(
         len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios
     )
@@ -46,7 +49,7 @@ def compare(
         for c in controllers:
             Episodes(1, Settings(scenario, plant, n_epm, c.action, c.observation, c.frame, control_hz))
     require(episodes >= 1, "episodes", "at least 1", episodes)
-    require(seed >= 0, "seed", "a whole number of at least 0", seed)
+    require(0 <= seed <= SEED_MAX, "seed", f"a whole number from 0 to {SEED_MAX}", seed)
     check_output_dir(out)
     records: list[Record] = []
     interrupted: KeyboardInterrupt | None = None

@@ -17,19 +17,26 @@ _WIDTH_MAX, _DEPTH_MAX = 4096, 8
 
 
 def check_net(net: tuple[int, ...]) -> None:
-    """Raise ``ValueError`` unless ``net`` is a sensible sequence of layer widths."""
-    fits = 1 <= len(net) <= _DEPTH_MAX and all(isinstance(w, int) and 1 <= w <= _WIDTH_MAX for w in net)
+    """Raise ``InputError`` unless ``net`` is a sensible sequence of layer widths."""
+    fits = 1 <= len(net) <= _DEPTH_MAX and all(type(w) is int and 1 <= w <= _WIDTH_MAX for w in net)
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
 
 
-def _check(kind: type, low: float, high: float, **values: object) -> None:
-    """Raise ``ValueError`` unless all values are finite numbers of the kind, above ``low`` and at most ``high``."""
-    kinds = (int, float) if kind is float else kind
-    whole, most = "whole " if kind is int else "", "" if high == math.inf else f", at most {high:g}"
-    must_be = f"a {'positive ' if low == 0 else ''}{whole}number{'' if low == 0 else f' above {low:g}'}{most}"
+def _whole(least: int, most: float, **values: object) -> None:
+    """Raise ``InputError`` unless all values are whole numbers from ``least`` to ``most``."""
     for name, value in values.items():
-        number = isinstance(value, kinds) and not isinstance(value, bool)
-        require(number and math.isfinite(value) and low < value <= high, name, must_be, value)  # type: ignore[arg-type,operator]
+        fits = isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+        limits = f"of at least {least}" if most == math.inf else f"from {least} to {most:.0f}"
+        require(fits, name, f"a whole number {limits}", value)
+
+
+def _number(above: float, most: float, **values: object) -> None:
+    """Raise ``InputError`` unless all values are finite numbers above ``above`` and at most ``most``."""
+    for name, value in values.items():
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        fits = number and math.isfinite(value) and above < value <= most  # type: ignore[arg-type,operator]
+        limits = f"above {above:g}" + ("" if most == math.inf else f", at most {most:g}")
+        require(fits, name, f"a number {limits}", value)
 
 
 @dataclass(frozen=True)
@@ -57,11 +64,11 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check(int, 0, 65_536, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
-        _check(int, 1, math.inf, batch_size=self.batch_size)
-        _check(float, 0, math.inf, learning_rate=self.learning_rate)
-        _check(float, 0, 1, gamma=self.gamma, gae_lambda=self.gae_lambda)
-        _check(float, -20, 2, log_std_init=self.log_std_init)
+        _whole(1, 65_536, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
+        _whole(2, math.inf, batch_size=self.batch_size)
+        _number(0, math.inf, learning_rate=self.learning_rate)
+        _number(0, 1, gamma=self.gamma, gae_lambda=self.gae_lambda)
+        _number(-20, 2, log_std_init=self.log_std_init)
         require(self.n_envs * self.n_steps > 1, "n_steps", "over 1 for a single episode", self.n_steps)
 
 
@@ -88,11 +95,11 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         check_net(self.net)
-        _check(int, 0, 65_536, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
-        _check(int, 0, 10_000_000, buffer_size=self.buffer_size)
-        _check(int, -1, math.inf, learning_starts=self.learning_starts)
-        _check(float, 0, math.inf, learning_rate=self.learning_rate)
-        _check(float, 0, 1, gamma=self.gamma)
+        _whole(1, 65_536, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
+        _whole(1, 10_000_000, buffer_size=self.buffer_size)
+        _whole(0, math.inf, learning_starts=self.learning_starts)
+        _number(0, math.inf, learning_rate=self.learning_rate)
+        _number(0, 1, gamma=self.gamma)
 
 
 STEPS: dict[Algo, int] = {"ppo": 3_000_000, "sac": 200_000}
@@ -124,9 +131,10 @@ class TrainConfig:
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None
-    """Folder for model, checkpoints, progress.csv and report; by default runs/train, or that of --resume."""
+    """Folder for model, checkpoints, progress.csv and report; by default runs/train (runs/train-2, ... where it holds a
+    run), or that of --resume."""
     resume: Path | None = None
-    """Folder of a run to go on with; its configuration counts, but for --steps and --out."""
+    """Folder of a run to go on with, as it was configured; --steps, --out and --checkpoint-every may change."""
     checkpoint_every: int = 250_000
     """Steps between checkpoints."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -135,14 +143,16 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require(self.algo in STEPS, "algo", " or ".join(STEPS), self.algo)
         if self.steps is not None:
-            _check(int, 0, math.inf, steps=self.steps)
-        _check(int, -1, 2**32 - 1, seed=self.seed)
-        _check(int, 0, math.inf, checkpoint_every=self.checkpoint_every)
+            _whole(1, math.inf, steps=self.steps)
+        _whole(0, 2**32 - 1, seed=self.seed)
+        _whole(1, math.inf, checkpoint_every=self.checkpoint_every)
 
     @property
     def folder(self) -> Path:
         """The run's folder: ``out``, or that of the run gone on with."""
-        return self.out or self.resume or Path("runs/train")
+        folder = self.out or self.resume
+        assert folder is not None
+        return folder
 
     @property
     def settings(self) -> Settings:

@@ -15,7 +15,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from agents.store import Card, Normalisation, load_card, load_policy
 from magenv.episodes import Episodes, Settings
-from magenv.params import require
+from magenv.params import InputError, require
 
 CLIP_OBSERVATION = 5.0
 """Normalised observations are clipped here, in training as in use."""
@@ -71,6 +71,11 @@ class Learned:
             f"statistics of shape {size}",
             statistics.mean.shape,
         )
+        try:
+            finite = bool(np.isfinite(self.predict(np.zeros(size, np.float32))[0]).all())
+        except ValueError:  # torch refuses to make a distribution of NaN
+            finite = False
+        require(finite, "model", "weights that give finite actions", str(folder))
 
     def seed(self, seed: int) -> None:
         """Do nothing: the policy's mode has no randomness."""
@@ -104,7 +109,7 @@ def load_weights(policy: BasePolicy, weights: dict[str, torch.Tensor]) -> None:
         policy.load_state_dict(weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:300]
-        raise ValueError(f"Input model must have weights that fit its card; instead received {reason}.") from error
+        raise InputError(f"Input model must have weights that fit its card; instead received {reason}.") from error
 
 
 def _build(

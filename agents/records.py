@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.params import require
+from magenv.params import InputError, require
 
 Floats = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def check_output_dir(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"Input out must be a folder that can be written; instead received {str(folder)!r} ({error.strerror})."
         ) from error
 
@@ -146,7 +146,7 @@ def load(path: Path) -> list[Record]:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             return _records({name: file[name] for name in file.files})
     except (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(
+        raise InputError(
             f"Input records file must be a readable file of magenv's records (.npz); instead received {str(path)!r}."
         ) from error
 

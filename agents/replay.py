@@ -11,7 +11,8 @@ from agents.metrics import by_controller, typical
 from agents.records import Record
 from magenv.params import PLANTS, System
 from magenv.poses import to_cartesian
-from magenv.render import Renderer, Scene
+from magenv.render import Renderer
+from magenv.scene import Scene
 from magenv.world import LOSSES
 
 PANELS = 3

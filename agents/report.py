@@ -40,8 +40,10 @@ _COLUMNS = (
     "apart before (mm)",
     "ms per step",
 )
+_UNPRINTED = "error until end (mm)"
+"""Column that only the page has room for."""
 _CAPTION = (
-    "Errors: mean over the successful episodes, below it the 95 % interval; until end: over all episodes. Separation "
+    "Errors: mean over the successful episodes, below it the 95 % interval. Separation "
     "and loss: medians; apart before: at the last instant at which both robots were near their references. "
     "ms: median, below it the 99th percentile."
 )
@@ -71,14 +73,24 @@ def write_summary(records: list[Record], folder: Path) -> list[Summary]:
     writer.writerows(asdict(measure(record)) for record in records)
     write_file(folder / "episodes.csv", table.getvalue().encode())
     (folder / "records").mkdir(exist_ok=True)
+    written = []
     for scenario, of_scenario in by_scenario(records).items():
         for controller, episodes in by_controller(of_scenario).items():
-            save(episodes, folder / "records" / f"{_file_name(controller)}_{scenario}.npz")
+            written.append(f"{file_name(controller)}_{scenario}.npz")
+            save(episodes, folder / "records" / written[-1])
+    _drop_others(folder / "records", ["*_*.npz"], written)
     return rows
 
 
+def _drop_others(folder: Path, patterns: list[str], written: list[str]) -> None:
+    """Remove what an earlier report left in the folder and this one did not write anew."""
+    for path in (path for pattern in patterns for path in folder.glob(pattern)):
+        if path.name not in written:
+            path.unlink()
+
+
 def print_table(rows: list[Summary], console: Console | None = None) -> None:
-    """Print the rows for a person to read, a table per scenario; 80 columns are enough."""
+    """Print the rows for a person to read, a table per scenario, without ``_UNPRINTED``; 80 columns are enough."""
     console = console or Console()
     for scenario in dict.fromkeys(row.scenario for row in rows):
         chosen = [row for row in rows if row.scenario == scenario]
@@ -86,10 +98,12 @@ def print_table(rows: list[Summary], console: Console | None = None) -> None:
         table.caption, table.caption_justify = _paper(scenario), "left"
         widest = max(len(row.controller) for row in chosen)
         table.add_column(_COLUMNS[0], min_width=min(max(widest, len(_COLUMNS[0])), 16), overflow="fold")
-        for column in _COLUMNS[1:]:
-            table.add_column(column.replace(" ", "\n"), justify="right", no_wrap=True)
+        printed = [index for index, column in enumerate(_COLUMNS[1:]) if column != _UNPRINTED]
+        for index in printed:
+            table.add_column(_COLUMNS[1 + index].replace(" ", "\n"), justify="right", no_wrap=True)
         for row in chosen:
-            values = [Text.assemble(value, (f"\n{detail}", "dim")) for value, detail in _cells(row)]
+            cells = _cells(row)
+            values = [Text.assemble(cells[index][0], (f"\n{cells[index][1]}", "dim")) for index in printed]
             table.add_row(Text(row.controller), *values)
         console.print(table)
     console.print(_CAPTION, style="dim")
@@ -111,6 +125,7 @@ def write_report(records: list[Record], folder: Path, command: str) -> list[Summ
     require(len(settings) == 1, "records", "episodes of one plant, number of EPMs and control rate", sorted(settings))
     check_output_dir(folder)
     rows = write_summary(records, folder)
+    written = []
     page = ["# Comparison of controllers", "", "Made by", "", "```", command, "```"]
     for scenario, of_scenario in by_scenario(records).items():
         pictures = {
@@ -124,6 +139,8 @@ def write_report(records: list[Record], folder: Path, command: str) -> list[Summ
             page += ["", f"![{title}]({name})"]
         write_file(folder / f"replay-{scenario}.gif", animate(of_scenario))
         page += ["", f"![One episode under several controllers](replay-{scenario}.gif)"]
+        written += [*pictures, f"replay-{scenario}.gif"]
+    _drop_others(folder, ["paths-*.png", "errors-*.png", "separation-*.png", "replay-*.gif"], written)
     page += ["", "## What the numbers mean", "", _MEANING, "", "## Versions", ""]
     page += [f"Python {platform.python_version()}, " + ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)]
     write_file(folder / "report.md", ("\n".join(page) + "\n").encode())
@@ -177,7 +194,8 @@ def _median(value: float | None) -> tuple[str, str]:
     return "-" if value is None else f"{value:.1f}", ""
 
 
-def _file_name(controller: str) -> str:
+def file_name(controller: str) -> str:
+    """Return the part of file names that stands for a controller."""
     return re.sub(r"[^\w.-]+", "-", controller)
 
 

@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save_file
 
 from agents.configs import check_net
 from magenv.episodes import Settings
-from magenv.params import require
+from magenv.params import InputError, require
 
 FORMAT = "magenv model 1"
 CARD, POLICY, TRAINING = "card.json", "policy.safetensors", "training.safetensors"
@@ -117,7 +117,7 @@ def load_card(folder: Path) -> Card:
     try:
         raw = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"Input model must be a magenv model; instead received {path}, which is not JSON.") from error
+        raise InputError(f"Input model must be a magenv model; instead received {path}, which is not JSON.") from error
     told = raw.pop("format", None) if isinstance(raw, dict) else None
     require(told == FORMAT, "model", f"a card of format {FORMAT!r}", told)
     try:
@@ -125,7 +125,7 @@ def load_card(folder: Path) -> Card:
         raw["net"] = tuple(raw["net"])
         card = Card(**raw)
     except (KeyError, TypeError) as error:
-        raise ValueError(f"Input model must have a whole card; instead received {path} ({error}).") from error
+        raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
     check_net(card.net)
     for name, value, kind in (
         ("algo", card.algo, str),
@@ -149,6 +149,9 @@ def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
     tensors = _load_tensors(Path(folder) / POLICY)
     for name in (_MEAN, _VARIANCE, _COUNT):
         require(name in tensors, "model", f"weights with {name}", str(Path(folder) / POLICY))
+    kinds = {name: torch.float64 if name in (_MEAN, _VARIANCE, _COUNT) else torch.float32 for name in tensors}
+    fits = all(value.dtype == kinds[name] for name, value in tensors.items())
+    require(fits, "model", "weights in float32 and statistics in float64", str(Path(folder) / POLICY))
     finite = all(bool(torch.isfinite(value).all()) for value in tensors.values())
     require(finite, "model", "finite weights", str(Path(folder) / POLICY))
     mean, variance, count = (tensors.pop(name).numpy().astype(np.float64) for name in (_MEAN, _VARIANCE, _COUNT))
@@ -168,7 +171,7 @@ def _load_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         tensors: dict[str, torch.Tensor] = load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(f"Input model must hold safetensors; instead received {path} ({error}).") from error
+        raise InputError(f"Input model must hold safetensors; instead received {path} ({error}).") from error
     return tensors
 
 

@@ -17,6 +17,7 @@ from agents.command import friendly, parse
 from agents.metrics import measure
 from agents.pid import Gains
 from agents.rollout import run
+from magenv.params import require
 
 START = Gains(force_p=0.1, force_i=0.005, force_d=0.01, torque_p=6e-5, torque_i=1e-6, torque_d=1e-6)
 """Where the search begins: each loop takes a good part of its error away in one hold."""
@@ -34,6 +35,10 @@ class TuneConfig:
     """Candidates tried."""
     control_hz: float = 2.0
     """Control rate."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("episodes", self.episodes), ("candidates", self.candidates)):
+            require(value >= 1, name, "at least 1", value)
 
 
 def gains_of(logarithms: NDArray[np.float64]) -> Gains:

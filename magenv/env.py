@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
-from magenv.render import RENDER_FPS, Renderer, scene_of
+from magenv.render import RENDER_FPS, Renderer
+from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
 
 _ACTIVE = np.ones(1, np.bool_)
@@ -89,7 +90,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         render_mode: str | None = None,
     ) -> None:
         modes = self.metadata["render_modes"]
-        require(render_mode in (None, *modes), "render_mode", "None, " + ", ".join(modes), render_mode)
+        require(render_mode in (None, *modes), "render_mode", "one of None, " + ", ".join(modes), render_mode)
         self.render_mode = render_mode
         self._episodes = Episodes(1, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
         self.layout = self._episodes.layout
@@ -147,6 +148,10 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._renderer is None:
             self._renderer = Renderer(self._episodes.system, self._episodes.plant, self.render_mode == "human")
         return self._renderer.draw(scene_of(self._episodes.world, 0))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes over: all but the pictures, which it draws anew."""
+        return vars(self) | {"_renderer": None}
 
     def close(self) -> None:
         """Close the window; may be called again."""

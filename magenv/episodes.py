@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
 from magenv.kernels import kernel
-from magenv.params import PLANTS, System, TaskParams, choose, require
+from magenv.params import PLANTS, InputError, System, TaskParams, choose, require
 from magenv.starts import Starts
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_terms
 from magenv.trajectories import named_trajectory, trajectory_of
@@ -53,7 +53,7 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
     try:
         numbers = np.array(action, dtype=np.float64, order="C")
     except (TypeError, ValueError):
-        raise ValueError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
+        raise InputError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
     if numbers.shape != shape:
         require(False, "action", f"an array of shape {shape}", numbers.shape)
     if not _clip(numbers.reshape(-1)):

@@ -8,20 +8,35 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 
 MU_0 = 4e-7 * math.pi
 """Vacuum permeability in H/m, the value of the paper."""
 
 
+class InputError(ValueError):
+    """What was passed in is not what it must be: the user's to mend, unlike any other ``ValueError``."""
+
+
 def require(condition: bool, name: str, must_be: str, received: object) -> None:
-    """Raise ``ValueError`` in the one form used for all bad input of this package."""
+    """Raise ``InputError`` in the one form used for all bad input of this package."""
     if not condition:
-        raise ValueError(f"Input {name} must be {must_be}; instead received {received!r}.")
+        raise InputError(f"Input {name} must be {must_be}; instead received {received!r}.")
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number, Python's or numpy's, and no bool."""
+    return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
+
+
+def is_whole(value: object) -> bool:
+    """Return whether a value is a whole number by its type, Python's or numpy's, and no bool."""
+    return not isinstance(value, bool) and isinstance(value, Integral)
 
 
 def _require_positive(**values: float) -> None:
     for name, value in values.items():
-        require(math.isfinite(value) and value > 0, name, "a positive, finite number", value)
+        require(_is_number(value) and value > 0, name, "a positive, finite number", value)
 
 
 @dataclass(frozen=True)
@@ -65,12 +80,7 @@ class System:
     """Greatest mutual attraction of two EPMs, 10 kg of payload (paper)."""
 
     def __post_init__(self) -> None:
-        require(
-            isinstance(self.n_epm, int) and not isinstance(self.n_epm, bool) and self.n_epm >= 1,
-            "n_epm",
-            "a whole number of at least 1",
-            self.n_epm,
-        )
+        require(is_whole(self.n_epm) and self.n_epm >= 1, "n_epm", "a whole number of at least 1", self.n_epm)
         _require_positive(r_min_m=self.r_min_m, r_max_m=self.r_max_m, attraction_max_n=self.attraction_max_n)
         require(self.r_max_m > self.r_min_m, "r_max_m", f"greater than r_min_m = {self.r_min_m}", self.r_max_m)
         if self.n_epm > 1:  # two points of a sphere are at most 2 r apart, three sqrt(3) r
@@ -117,7 +127,7 @@ class Body:
         _require_positive(mass_kg=self.mass_kg, inertia_kgm2=self.inertia_kgm2, diameter_m=self.diameter_m)
         for name in ("drag_linear_nspm", "drag_rotational_nmsprad"):
             value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, "a finite number of at least 0", value)
+            require(_is_number(value) and value >= 0, name, "a finite number of at least 0", value)
 
 
 @dataclass(frozen=True)
@@ -163,18 +173,16 @@ class TaskParams:
     """A robot nearer than this to its reference counts as tracking (``separation_tracked``)."""
 
     def __post_init__(self) -> None:
-        fits = isinstance(self.control_hz, (int, float)) and not isinstance(self.control_hz, bool)
         low, high = CONTROL_HZ_RANGE
-        require(
-            fits and low <= self.control_hz <= high, "control_hz", f"a number from {low} to {high}", self.control_hz
-        )
+        fits = _is_number(self.control_hz) and low <= self.control_hz <= high
+        require(fits, "control_hz", f"a number from {low} to {high}", self.control_hz)
         _require_positive(
             loss_distance_m=self.loss_distance_m,
             tracking_distance_m=self.tracking_distance_m,
         )
         for name in ("start_position_sd_m", "start_heading_sd_rad"):
             value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, name, "a finite number of at least 0", value)
+            require(_is_number(value) and value >= 0, name, "a finite number of at least 0", value)
 
     @property
     def period_s(self) -> float:

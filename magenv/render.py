@@ -7,31 +7,25 @@ Lengths are in m; x points right, y (from above) or z (from the side) up. pygame
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from magenv.params import Plant, System, require
-from magenv.world import LOSSES, World
-
-if TYPE_CHECKING:
-    from pygame import Surface
+from magenv.canvas import INK, Canvas, Colour, View, pale
+from magenv.params import Plant, System
+from magenv.scene import Scene
+from magenv.world import LOSSES
 
 Floats = NDArray[np.float64]
-Colour = tuple[int, int, int]
 
 RENDER_FPS = 10
 ROBOT_COLOURS: tuple[Colour, Colour] = ((0, 114, 178), (230, 159, 0))
 """Blue and orange of the Okabe-Ito palette: told apart by colour-blind eyes as well."""
-PATH_SAMPLES = 201
-"""Samples of the reference path in a ``Scene`` of a world."""
 
 _SIDE_PX, _STRIP_PX, _PANEL_PX = 800, 400, 330
 _DARK: tuple[Colour, Colour] = ((0, 58, 105), (140, 88, 0))
 _LIGHT: tuple[Colour, Colour] = ((140, 196, 228), (246, 212, 132))
-_INK, _GREY, _GRID, _PAPER, _WHITE = (40, 40, 46), (120, 120, 128), (232, 232, 236), (244, 244, 246), (255, 255, 255)
+_GREY, _GRID, _PAPER, _WHITE = (120, 120, 128), (232, 232, 236), (244, 244, 246), (255, 255, 255)
 _NORTH, _SOUTH, _ALARM = (196, 40, 52), (250, 250, 250), (164, 20, 36)
 _GRID_M = 0.020
 _TURN = np.linspace(0.5 * math.pi, 2.5 * math.pi, 32)
@@ -43,148 +37,8 @@ _LOSS_WORDS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What a picture shows, at one time."""
-
-    time_s: float
-    duration_s: float
-    """Of the whole reference."""
-    robots: Floats
-    """(2, 3) true x, y (m), heading (rad)."""
-    reference: Floats
-    """(2, 3) reference at this time: x, y (m), heading (rad)."""
-    path: Floats
-    """(k, 2, 2) reference of both robots over the whole duration: x, y (m)."""
-    epm_positions: Floats
-    """(N, 3) m."""
-    epm_directions: Floats
-    """(N, 3) unit moments."""
-    loss: int = 0
-    """Code into ``magenv.world.LOSSES``."""
-
-    def __post_init__(self) -> None:
-        require(self.robots.shape == (2, 3), "robots", "an array of shape (2, 3)", self.robots.shape)
-        require(self.reference.shape == (2, 3), "reference", "an array of shape (2, 3)", self.reference.shape)
-        require(self.path.shape[1:] == (2, 2), "path", "an array of shape (k, 2, 2)", self.path.shape)
-        epms = self.epm_positions.shape
-        require(len(epms) == 2 and epms[1] == 3, "epm_positions", "an array of shape (N, 3)", epms)
-        require(self.epm_directions.shape == epms, "epm_directions", f"of shape {epms}", self.epm_directions.shape)
-        require(self.loss in range(len(LOSSES)), "loss", f"from 0 to {len(LOSSES) - 1}", self.loss)
-
-    @property
-    def position_error_m(self) -> float:
-        """Distance from the reference, mean of the robots, in m."""
-        return float(np.hypot(*(self.robots - self.reference)[:, :2].T).mean())
-
-    @property
-    def heading_error_rad(self) -> float:
-        """Angle to the reference, absolute, mean of the robots, in rad."""
-        differences = (self.robots - self.reference)[:, 2]
-        if not np.isfinite(differences).all():
-            return math.nan
-        return sum(abs(math.remainder(difference, 2 * math.pi)) for difference in differences) / 2
-
-    @property
-    def separation_m(self) -> float:
-        """Distance of the robots' centres in m."""
-        return math.dist(self.robots[0, :2], self.robots[1, :2])
-
-
-def scene_of(world: World, row: int) -> Scene:
-    """Return a copy of what there is to see of one episode; where control is lost, at that very instant."""
-    trajectory = world.trajectory(row)
-    time = float(world.time_s()[row])
-    samples = np.linspace(0.0, trajectory.duration_s, PATH_SAMPLES)
-    return Scene(
-        time_s=time,
-        duration_s=trajectory.duration_s,
-        robots=world.robots[row, :, :3].copy(),
-        reference=trajectory.at(time),
-        path=np.stack([trajectory.at(sample)[:, :2] for sample in samples]),
-        epm_positions=world.epms[row, :, :3].copy(),
-        epm_directions=world.epms[row, :, 3:].copy(),
-        loss=int(world.measurements.loss[row]),
-    )
-
-
-@dataclass(frozen=True)
-class _View:
-    """A part of the picture in which a plane is drawn to scale."""
-
-    origin_px: tuple[float, float]
-    scale: float
-    """Pixels per m."""
-
-    def px(self, points: ArrayLike) -> Floats:
-        """Return the pixels (..., 2), counted downwards, of points (..., 2) in m."""
-        pixels: Floats = np.asarray(self.origin_px) + np.asarray(points) * (self.scale, -self.scale)
-        return pixels
-
-
-class _Canvas:
-    """A surface and the few marks made on it; positions in pixels."""
-
-    def __init__(self, size: tuple[int, int]) -> None:
-        import pygame
-
-        self._draw = pygame.draw
-        pygame.font.init()
-        self._shrink = pygame.transform.smoothscale_by
-        # Twice as large and shrunk: the letters of small fonts stand on whole pixels, unevenly.
-        self._fonts = {height: pygame.font.Font(None, 2 * height) for height in (18, 21, 26)}
-        # Bytes in the order of an RGB array, so that reading the picture is a plain copy.
-        self.surface: Surface = pygame.Surface(size, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
-
-    def disc(self, centre: Floats, radius: float, colour: Colour, width: int = 0) -> None:
-        """Fill a disc, or draw a ring ``width`` wide inside its edge."""
-        self._draw.aacircle(self.surface, colour, centre, radius, width)
-
-    def polygon(self, points: Floats, colour: Colour, edge: Colour | None = None) -> None:
-        """Fill a polygon (n, 2) with a smooth edge, of its own colour unless told."""
-        self._draw.polygon(self.surface, colour, points)
-        self._draw.aalines(self.surface, edge or colour, True, points)
-
-    def rectangle(self, box: tuple[int, int, int, int], colour: Colour) -> None:
-        """Fill a box (left, top, width, height)."""
-        self.surface.fill(colour, box)
-
-    def line(self, points: ArrayLike, colour: Colour, width: int) -> None:
-        """Draw a polyline (n, 2)."""
-        self._draw.lines(self.surface, colour, False, np.asarray(points), width)
-
-    def thread(self, ends: Floats, colour: Colour) -> None:
-        """Draw a smooth line, one pixel wide, between two points (2, 2)."""
-        # Not ``aalines``: of two points it reads a third, beyond its memory, and its ends vary from call to call.
-        self._draw.aaline(self.surface, colour, ends[0], ends[1])
-
-    def arrow(self, start: Floats, end: Floats, colour: Colour, width: float) -> None:
-        """Draw an arrow with a filled head; nothing where it would be shorter than its head."""
-        along = end - start
-        length = float(np.hypot(*along))
-        head = 3.0 * width
-        if length < head:
-            return
-        along = along / length
-        across = np.array([-along[1], along[0]])
-        neck = end - head * along
-        sides = [(start, 0.5), (neck, 0.5), (neck, 1.5), (end, 0.0), (neck, -1.5), (neck, -0.5), (start, -0.5)]
-        self.polygon(np.array([at + side * width * across for at, side in sides]), colour)
-
-    def text(self, words: str, at: ArrayLike, colour: Colour = _INK, height: int = 21, anchor: str = "midleft") -> None:
-        """Write words whose ``anchor``, a pygame rectangle's name of a point, is ``at``."""
-        image = self._shrink(self._fonts[height].render(words, True, colour), 0.5)
-        x, y = np.asarray(at)
-        self.surface.blit(image, image.get_rect(**{anchor: (round(x), round(y))}))
-
-
 def _direction(heading: float) -> Floats:
     return np.array([math.cos(heading), math.sin(heading)])
-
-
-def _pale(colour: Colour) -> Colour:
-    red, green, blue = (round(0.4 * value + 0.6 * 250) for value in colour)
-    return red, green, blue
 
 
 class Renderer:
@@ -206,10 +60,10 @@ class Renderer:
         self._epm = shrink * np.array([system.reference_epm.length_m, system.reference_epm.diameter_m]) / 2
         reach = system.r_max_m + float(np.hypot(*self._epm))
         middle = _SIDE_PX + _STRIP_PX / 2
-        self._zoom = _View((_SIDE_PX / 2, _SIDE_PX / 2), _SIDE_PX / 2 / (1.15 * self._wall))
-        self._above = _View((middle, 30 + _PANEL_PX / 2), _PANEL_PX / 2 / reach)
-        self._beside = _View((middle, 60 + 1.5 * _PANEL_PX), _PANEL_PX / 2 / reach)
-        self._canvas = _Canvas((_SIDE_PX + _STRIP_PX, _SIDE_PX))
+        self._zoom = View((_SIDE_PX / 2, _SIDE_PX / 2), _SIDE_PX / 2 / (1.15 * self._wall))
+        self._above = View((middle, 30 + _PANEL_PX / 2), _PANEL_PX / 2 / reach)
+        self._beside = View((middle, 60 + 1.5 * _PANEL_PX), _PANEL_PX / 2 / reach)
+        self._canvas = Canvas((_SIDE_PX + _STRIP_PX, _SIDE_PX))
         self._draw_backdrop()
         self._backdrop = self._canvas.surface.copy()
         self._path: Floats | None = None
@@ -295,7 +149,7 @@ class Renderer:
             for view, height in ((self._above, position[1]), (self._beside, 0.0)):
                 canvas.disc(view.px([position[0], height]), self._radius * view.scale, ROBOT_COLOURS[robot])
 
-    def _draw_robot(self, view: _View, pose: Floats, robot: int) -> None:
+    def _draw_robot(self, view: View, pose: Floats, robot: int) -> None:
         """Draw body, magnet and heading of a robot at ``pose`` (3,)."""
         canvas, along = self._canvas, _direction(pose[2])
         ends = view.px(pose[:2] + self._radius * np.array([[0.8], [2.4]]) * along)
@@ -306,7 +160,7 @@ class Renderer:
             corners = np.array([[0.0, -1.0], [pole, -1.0], [pole, 1.0], [0.0, 1.0]]) * self._ipm
             canvas.polygon(view.px(pose[:2] + corners @ axes), colour)
 
-    def _draw_reference(self, view: _View, pose: Floats, robot: int) -> None:
+    def _draw_reference(self, view: View, pose: Floats, robot: int) -> None:
         """Draw the outline of where a robot should be."""
         self._canvas.disc(view.px(pose[:2]), self._radius * view.scale, _DARK[robot], 2)
         ends = view.px(pose[:2] + self._radius * np.array([[1.0], [2.8]]) * _direction(pose[2]))
@@ -341,10 +195,10 @@ class Renderer:
         for view, vertical, toward in ((self._above, 1, np.array([0, 0, 1])), (beside, 2, np.array([0, -1, 0]))):
             for k in np.argsort(scene.epm_positions @ toward, kind="stable"):
                 centre, moment = scene.epm_positions[k], scene.epm_directions[k]
-                pale = view is self._above and centre[2] < 0
-                self._draw_epm(view, centre[[0, vertical]], moment[[0, vertical]], float(moment @ toward), pale)
+                under = view is self._above and centre[2] < 0
+                self._draw_epm(view, centre[[0, vertical]], moment[[0, vertical]], float(moment @ toward), under)
             for k, centre in enumerate(scene.epm_positions):
-                canvas.disc(view.px(centre[[0, vertical]]), 8, _INK)
+                canvas.disc(view.px(centre[[0, vertical]]), 8, INK)
                 canvas.text(chr(ord("A") + k), view.px(centre[[0, vertical]]), _WHITE, 18, "center")
         for k, (centre, moment) in enumerate(zip(scene.epm_positions, scene.epm_directions, strict=True)):
             y = 60 + 2 * _PANEL_PX + 32 + 18 * k
@@ -353,7 +207,7 @@ class Renderer:
             elevation = math.degrees(math.asin(min(max(moment[2], -1.0), 1.0)))
             canvas.text(f"{elevation:+.0f}\N{DEGREE SIGN}", (_SIDE_PX + 340, y), anchor="midright")
 
-    def _draw_epm(self, view: _View, centre: Floats, axis: Floats, toward: float, pale: bool) -> None:
+    def _draw_epm(self, view: View, centre: Floats, axis: Floats, toward: float, under: bool) -> None:
         """Draw a cylinder at ``centre`` (2,), its unit moment ``axis`` (2,) in the view and ``toward`` the viewer."""
         canvas, (half_length, radius) = self._canvas, self._epm
         across = float(np.hypot(*axis))
@@ -368,13 +222,13 @@ class Renderer:
             return view.px(centre + np.concatenate([back + low * shift, front + high * shift]) @ axes)
 
         ends = [(_NORTH, 0.0, 1.0), (_SOUTH, -1.0, 0.0)]
-        edge = _pale(_INK) if pale else _INK
+        edge = pale(INK) if under else INK
         near = 1.0 if toward >= 0 else -1.0
         arrow = view.px([centre + half_length * axis, centre + (half_length + 0.1) * axis])
         if near < 0:
             canvas.arrow(arrow[0], arrow[1], edge, 3.5)
         for colour, low, high in ends[:: -int(near)]:  # the pole nearer to the viewer comes last
-            colour = _pale(colour) if pale else colour
+            colour = pale(colour) if under else colour
             canvas.polygon(swept(low, high), colour, edge)
         canvas.polygon(swept(near, near), colour, edge)
         if near > 0:
@@ -427,11 +281,11 @@ class Renderer:
             canvas.text(words, (_SIDE_PX + x, 60 + 2 * _PANEL_PX + 14), _GREY, anchor="center")
         self._draw_legend()
 
-    def _draw_scale(self, view: _View, right_end: tuple[float, float], length: float) -> None:
+    def _draw_scale(self, view: View, right_end: tuple[float, float], length: float) -> None:
         """Draw a scale bar of ``length`` (m) that ends at ``right_end`` (px)."""
         x, y = right_end
         left = x - length * view.scale
-        self._canvas.line([[left, y - 4], [left, y], [x, y], [x, y - 4]], _INK, 2)
+        self._canvas.line([[left, y - 4], [left, y], [x, y], [x, y - 4]], INK, 2)
         self._canvas.text(f"{1e3 * length:.0f} mm", ((left + x) / 2, y - 12), height=18, anchor="center")
 
     def _draw_legend(self) -> None:
@@ -443,14 +297,14 @@ class Renderer:
             canvas.text(words, (86, top + 22 * row))
         for robot, colour in enumerate(ROBOT_COLOURS):
             x = 14 + 34 * robot
-            views = [_View((x + 6, top + 22 * row), 0.4 * self._zoom.scale) for row in (1, 2)]
+            views = [View((x + 6, top + 22 * row), 0.4 * self._zoom.scale) for row in (1, 2)]
             canvas.line([[x, top], [x + 24, top]], _LIGHT[robot], 3)
             self._draw_robot(views[0], np.zeros(3), robot)
             self._draw_reference(views[1], np.zeros(3), robot)
             for dot in (3.0, 12.0, 21.0):
                 canvas.disc(np.array([x + dot, top + 66]), 1.5, colour)
-        for left, pole, colour, ink in ((14, "S", _SOUTH, _INK), (43, "N", _NORTH, _WHITE)):
-            canvas.rectangle((left, top + 80, 29, 16), _INK)
+        for left, pole, colour, ink in ((14, "S", _SOUTH, INK), (43, "N", _NORTH, _WHITE)):
+            canvas.rectangle((left, top + 80, 29, 16), INK)
             canvas.rectangle((left + 1, top + 81, 27, 14), colour)
             canvas.text(pole, (left + 15, top + 89), ink, 18, "center")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode
 from magenv.episodes import Bools, Episodes, Settings, check_action
 from magenv.params import require
-from magenv.render import RENDER_FPS, Renderer, scene_of
+from magenv.render import RENDER_FPS, Renderer
+from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
 
 Observations = NDArray[np.float32]
@@ -155,12 +157,17 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one RGB array (h, w, 3) per episode."""
         if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='rgb_array' given to gymnasium.make_vec.")
             return None
         if not self._renderers:
             for _ in range(self.num_envs):
                 self._renderers.append(Renderer(self._episodes.system, self._episodes.plant, window=False))
         frames = [r.draw(scene_of(self._episodes.world, row)) for row, r in enumerate(self._renderers)]
         return tuple(frame for frame in frames if frame is not None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes over: all but the pictures, which it draws anew."""
+        return vars(self) | {"_renderers": []}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderers."""

@@ -12,15 +12,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from magenv.params import require
+from magenv.params import is_whole, require
 
 
 class Workers:
     """Runs kernels over rows on ``threads`` threads, the calling one included; the bits do not depend on how many."""
 
     def __init__(self, threads: int = 1) -> None:
-        whole = isinstance(threads, int) and not isinstance(threads, bool) and threads >= 1
-        require(whole, "threads", "a whole number of at least 1", threads)
+        require(is_whole(threads) and threads >= 1, "threads", "a whole number of at least 1", threads)
         self.threads = threads
         self._pool: ThreadPoolExecutor | None = None
         self._owner = 0

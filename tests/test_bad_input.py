@@ -86,7 +86,7 @@ def test_arguments_of_the_env(arguments: dict[str, Any], name: str, must_be: str
 
 
 def test_render_mode() -> None:
-    with pytest.raises(ValueError, match=told("render_mode", "None, human, rgb_array", "ascii")):
+    with pytest.raises(ValueError, match=told("render_mode", "one of None, human, rgb_array", "ascii")):
         TwoRobots(render_mode="ascii")
     with pytest.raises(ValueError, match=told("render_mode", "None or rgb_array", "human")):
         TwoRobotsVector(2, render_mode="human")

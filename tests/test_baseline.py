@@ -116,6 +116,17 @@ def test_one_observation_or_many(make_env: Any, make: Any, n_epm: int) -> None:
         controller.predict(rows[:, :-1])
 
 
+def test_a_row_does_not_depend_on_its_neighbours(observations: Observations) -> None:
+    controller = paper_baseline()
+    together, _ = controller.predict(observations)
+    others = observations[[1, 1, 2, 1, 4]]
+    controller.seed(0)
+    np.testing.assert_array_equal(controller.predict(others)[0][[2, 4]], together[[2, 4]])
+    controller.seed(0)
+    same = controller.predict(observations[[0, 0]])[0]
+    assert not np.array_equal(same[0], same[1]), "two rows draw the same random starts"
+
+
 def test_its_seed_fixes_its_actions_and_its_state_its_memory(observations: Observations) -> None:
     one, two = paper_baseline(), paper_baseline()
     for controller in (one, two):

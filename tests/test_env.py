@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import pickle
 from collections.abc import Callable, Iterator
@@ -89,6 +90,19 @@ def test_checkers_find_nothing(
     env = make_env(action=mode, n_epm=n_epm, frame=frame, observation=observation)
     check_env(env, skip_render_check=True)
     check_env_sb3(env, warn=True, skip_render_check=True)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_a_drawn_env_goes_on_as_the_original(make_env: MakeEnv, copied: Callable[[Any], Any]) -> None:
+    env = make_env(render_mode="rgb_array")
+    env.reset(seed=3)
+    before = env.render()
+    other = copied(env)
+    action = np.full(10, 0.1, np.float32)
+    np.testing.assert_array_equal(other.step(action)[0], env.step(action)[0])
+    assert before is not None
+    assert other.render().shape == before.shape
+    other.close()
 
 
 def test_spec_goes_through_json_and_pickle() -> None:
@@ -236,8 +250,8 @@ def test_what_was_returned_does_not_change_later(make_env: MakeEnv, observation:
         keep(values, info)
         if terminated or truncated:
             keep(*env.reset())
-    for value, copy in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(value, copy)
+    for value, copied in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(value, copied)
     assert not any(np.shares_memory(a, b) for i, a in enumerate(kept) for b in kept[:i])
 
 

@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
+from agents.checkpoints import checkpoints, restore, save_model, stored_config
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import Learned
-from agents.learning import build, checkpoints, restore, save_model, train
+from agents.learning import build, train
 from agents.rollout import run
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import CARD, POLICY, TRAINING, load_card, load_policy, load_training
@@ -60,6 +62,11 @@ def config(tmp_path: Path) -> MakeConfig:
         return dataclasses.replace(CONFIGS[algo], **({"out": tmp_path / "run"} | changes))
 
     return make
+
+
+def going_on(run_folder: Path, **changes: Any) -> TrainConfig:
+    """Return the configuration with which to go on with a run, with changes."""
+    return dataclasses.replace(stored_config(run_folder), **changes)
 
 
 def tensors_of(run_folder: Path) -> dict[str, torch.Tensor]:
@@ -114,7 +121,7 @@ def test_an_agent_learns_a_tiny_task(tmp_path: Path, monkeypatch: pytest.MonkeyP
     folder, finished = train(tiny)
     assert finished
     held_s = {}
-    for name, path in (("untrained", tmp_path / "untrained"), ("trained", folder)):
+    for name, path in (("untrained", tmp_path / "untrained"), ("trained", folder / "model")):
         records = run(Learned(path), "approach-100", "tiny", control_hz=10.0, episodes=6, seed=100)
         held_s[name] = np.array([record.time_s[-1] for record in records])
     assert held_s["untrained"].max() < 1.0
@@ -144,7 +151,8 @@ def test_a_run_leaves_model_checkpoints_and_progress(config: MakeConfig, algo: s
     wanted = config(algo)
     folder, finished = train(wanted, "python train.py --tiny")
     assert finished
-    assert folder == wanted.out / "model"
+    assert folder == wanted.out
+    folder = folder / "model"
     assert sorted(path.name for path in folder.iterdir()) == [CARD, POLICY]
     card = load_card(folder)
     assert (card.algo, card.steps, card.command) == (algo, wanted.total_steps, "python train.py --tiny")
@@ -248,7 +256,7 @@ def test_a_resumed_run_goes_on_where_it_stood(config: MakeConfig, algo: str) -> 
     first = config(algo)
     train(first)
     before, past = load_training(checkpoints(first.out)[-1]), rows_of(first.out)
-    _, finished = train(TrainConfig(resume=first.out, steps=2 * first.total_steps))
+    _, finished = train(going_on(first.out, steps=2 * first.total_steps))
     assert finished
     assert steps_of(first.out)[-1] == load_card(first.out / "model").steps == 2 * first.total_steps
     after = load_training(checkpoints(first.out)[-1])
@@ -277,7 +285,7 @@ def test_the_learning_rate_goes_on_falling_after_a_resume(config: MakeConfig) ->
         Interrupter(patch, at=40)
         train(config())
     before = rates_of(config().out)
-    train(TrainConfig(resume=config().out))
+    train(going_on(config().out))
     rates = [rate for _, rate in rates_of(config().out)]
     assert rates == sorted(rates, reverse=True)
     assert len(rates) > len(before)
@@ -287,7 +295,7 @@ def test_the_learning_rate_goes_on_falling_after_a_resume(config: MakeConfig) ->
 
 def test_a_longer_run_has_the_learning_rates_of_one_planned_so_long(config: MakeConfig) -> None:
     train(config())
-    train(TrainConfig(resume=config().out, steps=1024))
+    train(going_on(config().out, steps=1024))
     planned = [(0.1 + 0.9 * (1 - steps / 1024)) * PPO_CONFIG.ppo.learning_rate for steps in (640, 768, 896, 1024)]
     rates = [rate for steps, rate in rates_of(config().out) if steps > 640]
     assert rates[:3] == pytest.approx(planned[:3])
@@ -306,8 +314,8 @@ def test_a_resumed_run_does_not_meet_its_first_episodes_again(config: MakeConfig
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TwoRobotsVecEnv, "reset", watched)
         train(config(steps=128, out=config().out.parent / "again"))
-        train(TrainConfig(resume=config().out, steps=256))
-        train(TrainConfig(resume=config().out, steps=384))
+        train(going_on(config().out, steps=256))
+        train(going_on(config().out, steps=384))
     fresh, second, third = seen
     assert not np.array_equal(second, fresh)
     assert not np.array_equal(third, fresh)
@@ -317,28 +325,27 @@ def test_a_resumed_run_does_not_meet_its_first_episodes_again(config: MakeConfig
 def test_a_run_can_be_gone_on_with_elsewhere(config: MakeConfig, tmp_path: Path) -> None:
     train(config())
     before = {path.name: path.stat().st_mtime_ns for path in config().out.rglob("*")}
-    train(TrainConfig(resume=config().out, steps=640, out=tmp_path / "elsewhere"))
+    train(going_on(config().out, steps=640, out=tmp_path / "elsewhere"))
     assert {path.name: path.stat().st_mtime_ns for path in config().out.rglob("*")} == before
     assert load_card(tmp_path / "elsewhere" / "model").steps == 640
     assert total_steps(rows_of(tmp_path / "elsewhere"))[0] == 128
 
 
-def test_a_resumed_sac_fills_its_replay_buffer_before_it_learns(
+def test_a_resumed_sac_fills_its_replay_buffer_by_its_policy_before_it_learns(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from stable_baselines3 import SAC
-
     train(config("sac"))
     sizes, original = [], SAC.train
 
     def watched(model: SAC, gradient_steps: int, batch_size: int = 64) -> None:
         assert model.replay_buffer is not None
-        if gradient_steps:
-            sizes.append(model.replay_buffer.size() * model.n_envs)
+        sizes.append(model.replay_buffer.size() * model.n_envs)
+        assert gradient_steps == SAC_CONFIG.sac.gradient_steps
         original(model, gradient_steps, batch_size)
 
     monkeypatch.setattr(SAC, "train", watched)
-    train(TrainConfig(resume=config().out, steps=640))
+    monkeypatch.setattr("gymnasium.spaces.Box.sample", lambda _: pytest.fail("a random action"))
+    train(going_on(config().out, steps=640))
     assert sizes[0] >= SAC_CONFIG.sac.learning_starts
     assert len(sizes) > 20
 
@@ -346,13 +353,16 @@ def test_a_resumed_sac_fills_its_replay_buffer_before_it_learns(
 def test_runs_that_cannot_be_gone_on_with_are_refused(config: MakeConfig, tmp_path: Path) -> None:
     def refused(**changes: Any) -> str:
         with pytest.raises(ValueError, match=r"^Input .+ must .+; instead received .+") as raised:
-            train(TrainConfig(**({"resume": config().out, "steps": 1024} | changes)))
+            train(going_on(**({"run_folder": config().out, "steps": 1024} | changes)))
         assert "\n" not in str(raised.value)
         return str(raised.value)
 
-    assert "resume" in refused(resume=tmp_path / "nowhere")
+    assert "resume" in refused(run_folder=tmp_path / "nowhere")
     train(config())
     assert "steps" in refused(steps=512)
+    assert "'ppo', as in the run gone on with; instead received 'sac'" in refused(algo="sac")
+    assert "n_epm" in refused(n_epm=3)
+    assert "ppo" in refused(ppo=PPOConfig(gamma=0.5))
     kept = tmp_path / "kept"
     shutil.copytree(config().out, kept)
 
@@ -400,12 +410,13 @@ def test_ctrl_c_leaves_a_model_and_a_checkpoint_to_go_on_from(
     wanted = config(algo)
     with monkeypatch.context() as patch:
         Interrupter(patch, at=26)  # 25 steps of 8 environments are done
-        folder, finished = train(wanted, "python train.py")
+        _, finished = train(wanted, "python train.py")
+    folder = wanted.out / "model"
     assert not finished
     assert load_card(folder).steps == steps_of(wanted.out)[-1] == 200
     assert Learned(folder).predict(np.zeros(63, np.float32))[0].shape == (10,)
     assert total_steps(rows_of(wanted.out))[-1] == 200
-    _, finished = train(TrainConfig(resume=wanted.out))
+    _, finished = train(going_on(wanted.out))
     assert finished
     assert load_card(folder).steps >= wanted.total_steps
     steps = total_steps(rows_of(wanted.out))
@@ -414,16 +425,15 @@ def test_ctrl_c_leaves_a_model_and_a_checkpoint_to_go_on_from(
 
 
 @pytest.mark.parametrize("at", [0, 1])
-def test_ctrl_c_before_anything_is_learned_keeps_the_model_that_was_there(
+def test_ctrl_c_before_anything_is_learned_leaves_nothing_that_hinders(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    train(config())
-    before = {path: path.read_bytes() for path in (config().out / "model").iterdir()}
-    Interrupter(monkeypatch, at)
-    with pytest.raises(KeyboardInterrupt):
-        train(config())
-    assert {path: path.read_bytes() for path in (config().out / "model").iterdir()} == before
-    assert steps_of(config().out)[-1] == 512
+    with monkeypatch.context() as patch:
+        Interrupter(patch, at)
+        with pytest.raises(KeyboardInterrupt):
+            train(config())
+    assert not (config().out / "model").exists()
+    assert train(config()) == (config().out, True)
 
 
 def test_ctrl_c_right_after_a_resume_keeps_what_was_there(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -431,23 +441,68 @@ def test_ctrl_c_right_after_a_resume_keeps_what_was_there(config: MakeConfig, mo
     with monkeypatch.context() as patch:
         Interrupter(patch, at=0)
         with pytest.raises(KeyboardInterrupt):
-            train(TrainConfig(resume=config().out, steps=640))
+            train(going_on(config().out, steps=640))
     assert steps_of(config().out)[-1] == 512
-    train(TrainConfig(resume=config().out, steps=640))
+    train(going_on(config().out, steps=640))
     assert steps_of(config().out)[-1] == 640
 
 
-def test_a_new_run_in_an_old_runs_folder_keeps_its_own_checkpoints(
-    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    train(config(steps=1024))
-    with monkeypatch.context() as patch:
-        Interrupter(patch, at=41)
-        train(config(seed=1))
-    assert steps_of(config().out) == [256, 320]
-    assert all(load_card(path).config["seed"] == 1 for path in checkpoints(config().out))
-    train(TrainConfig(resume=config().out))
-    assert load_card(config().out / "model").config["seed"] == 1
+def files_of(folder: Path) -> dict[Path, bytes]:
+    """Return all files below a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_new_run_never_takes_the_folder_of_an_old_one(config: MakeConfig, tmp_path: Path) -> None:
+    train(config())
+    before = files_of(config().out)
+    for again in (config(seed=1), going_on(config().out, steps=640, out=config().out.parent / "other")):
+        (tmp_path / "other" / "checkpoints").mkdir(parents=True, exist_ok=True)
+        with pytest.raises(ValueError, match=r"^Input out must be a folder without a run"):
+            train(again)
+    assert files_of(config().out) == before
+
+
+def test_two_runs_begun_at_once_have_folders_of_their_own(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    inner, original = [], PPO.learn
+
+    def learn(model: PPO, *arguments: Any, **options: Any) -> PPO:
+        if not inner:
+            inner.append(None)
+            inner[0] = train(config(steps=128, out=None))[0]
+        return original(model, *arguments, **options)
+
+    monkeypatch.setattr(PPO, "learn", learn)
+    outer, _ = train(config(steps=128, out=None, seed=1))
+    assert (outer, inner[0]) == (Path("runs/train"), Path("runs/train-2"))
+    assert [load_card(folder / "model").config["seed"] for folder in (outer, inner[0])] == [1, 0]
+
+
+def test_after_a_kill_progress_tells_only_what_counts(config: MakeConfig) -> None:
+    train(config())
+    shutil.rmtree(checkpoints(config().out)[-1])  # as if killed after the last rollout, before its checkpoint
+    log = config().out / "progress.csv"
+    log.write_text(
+        log.read_text() + "1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24\n"
+    )  # and half written
+    train(going_on(config().out))
+    steps = total_steps(rows_of(config().out))
+    assert steps == sorted(steps)
+    assert steps[-1] == 512
+    updates = [int(row["train/n_updates"]) for row in rows_of(config().out) if row["train/n_updates"]]
+    assert updates == sorted(updates)
+
+
+def test_default_folders_are_counted_up(config: MakeConfig) -> None:
+    folders = [train(config(steps=128, out=None))[0] for _ in range(3)]
+    assert folders == [Path("runs/train"), Path("runs/train-2"), Path("runs/train-3")]
+    assert [load_card(folder / "model").steps for folder in folders] == [128] * 3
+
+
+def test_going_on_in_the_same_folder_by_another_name(config: MakeConfig) -> None:
+    train(config())
+    (config().out.parent / "alias").symlink_to(config().out)
+    train(going_on(config().out, steps=640, out=config().out.parent / "alias"))
+    assert steps_of(config().out)[-1] == 640
 
 
 KILLED = """
@@ -487,7 +542,7 @@ def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_before(c
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
     assert steps_of(folder) == [128]
     Learned(checkpoints(folder)[-1])
-    _, finished = train(TrainConfig(resume=folder))
+    _, finished = train(going_on(folder))
     assert finished
     assert load_card(folder / "model").steps == 512
     assert total_steps(rows_of(folder))[0] == 128

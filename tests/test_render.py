@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 import magenv
 from magenv.episodes import Episodes, Settings
 from magenv.params import PLANTS, System
-from magenv.render import RENDER_FPS, ROBOT_COLOURS, Renderer, Scene, scene_of
+from magenv.render import RENDER_FPS, ROBOT_COLOURS, Renderer
+from magenv.scene import Scene, scene_of
 from magenv.trajectories import approach
 from magenv.world import LOSSES
 

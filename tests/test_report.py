@@ -61,6 +61,16 @@ def test_a_report_is_complete(records: list[Record], tmp_path: Path) -> None:
     assert "51 s" in page
 
 
+def test_a_report_in_an_old_ones_folder_leaves_nothing_of_it(records: list[Record], tmp_path: Path) -> None:
+    for one, other in (("approach-60", "approach-30"), ("approach-60", "approach-60")):
+        write_report([a_record(scenario=one)], tmp_path, "")
+        write_report([a_record(scenario=other, controller="ppo")], tmp_path, "")
+        pictures = {path.name for path in tmp_path.iterdir() if path.suffix in (".png", ".gif")}
+        assert len(pictures) == 4
+        assert all(other in name for name in pictures)
+        assert [path.name for path in (tmp_path / "records").iterdir()] == [f"ppo_{other}.npz"]
+
+
 def test_the_summary_is_strict_json_and_episodes_stand_beside_it(records: list[Record], tmp_path: Path) -> None:
     rows = write_report(records, tmp_path, "")
 
@@ -94,7 +104,8 @@ def test_a_report_is_of_one_setting(tmp_path: Path) -> None:
 
 def test_the_table_is_whole_in_80_columns(records: list[Record]) -> None:
     text = io.StringIO()
-    rows = summarise([*records, a_record(controller="[bold]a-rather-long-name-of-a-controller")])
+    spread = [a_record(controller="wide", error_m=0.0004567 * k, seed=k, step_ms=np.full(STEPS, 123.4)) for k in (1, 2)]
+    rows = summarise([*records, a_record(controller="[bold]a-rather-long-name-of-a-controller"), *spread])
     print_table(rows, Console(file=text, width=80))
     lines = text.getvalue().splitlines()
     assert max(len(line) for line in lines) <= 80
@@ -106,6 +117,9 @@ def test_the_table_is_whole_in_80_columns(records: list[Record]) -> None:
     (lost,) = (line.split() for line in lines if line.strip().startswith("baseline"))
     assert lost[1:5] == ["0", "%", "-", "-"]
     assert "15.0" in lost
+    (wide,) = (index for index, line in enumerate(lines) if line.strip().startswith("wide"))
+    assert lines[wide].split()[-1] == lines[wide + 1].split()[-1] == "123.4", "the last column is cut"
+    assert re.search("[.0-9]{5}\N{EN DASH}[.0-9]{5} ", lines[wide + 1]), "no interval of full width"
 
 
 @pytest.mark.parametrize("below", [".", "deeper/down"])

@@ -1,4 +1,4 @@
-"""The claims of the README, on few episodes: who holds what, and that the substep does not decide it."""
+"""The claims of the README: who holds what, and that the substep does not decide it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from agents.metrics import Summary, summarise
 from agents.rollout import run
 from magenv.params import PLANTS
 
+EPISODES = 20
+"""As many as ``evaluate.py`` runs."""
+
 
 def summary(name: str, scenario: str, episodes: int) -> Summary:
     (row,) = summarise(run(controller(name), scenario, episodes=episodes))
@@ -21,12 +24,28 @@ def summary(name: str, scenario: str, episodes: int) -> Summary:
     ("scenario", "position_mm", "heading_deg"), [("approach-60", 1.5, 16.7), ("approach-30", 4, 30)]
 )
 def test_the_shipped_agent_holds_both_scenarios(scenario: str, position_mm: float, heading_deg: float) -> None:
-    row = summary("ppo", scenario, 5)
-    assert row.success_rate == 1.0
+    row = summary("ppo", scenario, EPISODES)
+    assert row.success_rate >= 0.95
     assert row.position_error_mm is not None
     assert row.position_error_mm <= position_mm
     assert row.heading_error_deg is not None
     assert row.heading_error_deg <= heading_deg
+
+
+def test_the_papers_controller_shows_the_papers_outcome() -> None:
+    """The bands to which plant and gains were calibrated, about the paper's 8.7 mm, 16.7 deg, 51 s and 33 mm."""
+    held = summary("baseline", "approach-60", EPISODES)
+    assert held.success_rate >= 0.95
+    assert held.position_error_mm is not None
+    assert 7 <= held.position_error_mm <= 10.5
+    assert held.heading_error_deg is not None
+    assert 13 <= held.heading_error_deg <= 20
+    lost = summary("baseline", "approach-30", EPISODES)
+    assert lost.success_rate <= 0.1
+    assert lost.loss_of_control_s is not None
+    assert 45 <= lost.loss_of_control_s <= 57
+    assert lost.separation_before_loss_mm is not None
+    assert 30 <= lost.separation_before_loss_mm <= 40
 
 
 @pytest.mark.parametrize("scenario", ["approach-60", "approach-30"])
@@ -40,15 +59,15 @@ def test_halving_the_substep_changes_no_error_by_over_2_percent(scenario: str, m
     assert halved.position_error_mm != whole.position_error_mm  # the substep did change
 
 
-@pytest.mark.parametrize("name", ["baseline", "tuned"])
-def test_the_pids_hold_60_mm_and_lose_30(name: str) -> None:
-    assert summary(name, "approach-60", 2).success_rate == 1.0
-    lost = summary(name, "approach-30", 2)
-    assert lost.success_rate == 0.0
-    assert lost.loss_of_control_s is not None
-    assert 30 < lost.loss_of_control_s < 70
+def test_the_best_gains_hold_60_mm_far_better_and_lose_30_too() -> None:
+    held = summary("tuned", "approach-60", 5)
+    assert held.success_rate == 1.0
+    assert held.position_error_mm is not None
+    assert held.position_error_mm < 1.0
+    assert summary("tuned", "approach-30", 5).success_rate == 0.0
 
 
 @pytest.mark.parametrize("name", ["idle", "random"])
 def test_without_control_nothing_is_held(name: str) -> None:
-    assert summary(name, "approach-60", 3).success_rate == 0.0
+    for scenario in ("approach-60", "approach-30"):
+        assert summary(name, scenario, EPISODES).success_rate == 0.0

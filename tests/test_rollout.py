@@ -96,6 +96,7 @@ def test_a_controllers_random_numbers_are_not_the_environments() -> None:
     assert len(set(seeds)) == 100
     assert controller_seed(3) == seeds[3]
     for seed, own in enumerate(seeds):
+        assert own != np.random.SeedSequence(seed).generate_state(1)[0], "the environment's own stream"
         assert np.random.default_rng(own).normal() != np.random.default_rng(seed).normal()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -16,11 +17,12 @@ from typing import Any
 
 import pytest
 
+from agents.checkpoints import checkpoints, stored_config
 from agents.command import friendly
-from agents.configs import TrainConfig
 from agents.learned import Learned
-from agents.learning import checkpoints, train
+from agents.learning import train
 from agents.store import load_card
+from magenv.params import InputError
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "80"}
@@ -144,6 +146,17 @@ def test_evaluate_lists_its_controllers(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_evaluate_leaves_out_agents_made_for_another_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = ["--n-epm", "3", "--episodes", "1", "--scenarios", "approach-60"]
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *asked])
+    runpy.run_path(str(ROOT / "evaluate.py"), run_name="__main__")
+    assert [row["controller"] for row in summary(tmp_path / "runs" / "evaluate")] == ["baseline", "tuned"]
+    assert re.search(r"left out: ppo \(Input n_epm for ppo must be 2.*received 3", capfd.readouterr().err)
+
+
 def test_train_trains_compares_and_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
     done = call(tmp_path, "short", *TINY, "--steps", "256", "--checkpoint-every", "128", "--out", str(out))
@@ -177,7 +190,7 @@ def test_ctrl_c_in_train_leaves_a_model_and_a_checkpoint(
     rows = (out / "progress.csv").read_text().splitlines()
     assert len(rows) >= 2
     assert not (out / "summary.json").exists()
-    _, finished = train(TrainConfig(resume=out, steps=load_card(out / "model").steps + 128))
+    _, finished = train(dataclasses.replace(stored_config(out), steps=load_card(out / "model").steps + 128))
     assert finished
     assert (out / "progress.csv").read_text().count("\n") > len(rows)
 
@@ -219,23 +232,29 @@ BAD = {
     "controller twice": ("evaluate.py", ["--controllers", "idle", "idle"], "each once.*'idle', 'idle'"),
     "scenario": ("evaluate.py", ["--controllers", "idle", "--scenarios", "approach-60", "line"], "approach.*'line'"),
     "scenario twice": ("evaluate.py", ["--controllers", "idle", "--scenarios", "random", "random"], "each once"),
+    "controllers of one file": ("evaluate.py", ["--controllers", "id-le", "id/le"], "'id-le'"),
+    "seed too large": ("evaluate.py", ["--controllers", "idle", "--seed", str(2**63 - 1)], "4294967295"),
     "plant": ("evaluate.py", ["--controllers", "idle", "--plant", "moon"], "paper.*'moon'"),
     "episodes": ("evaluate.py", ["--controllers", "idle", "--episodes", "0"], "at least 1.*0"),
-    "seed": ("evaluate.py", ["--controllers", "idle", "--seed", "-1"], "at least 0.*-1"),
+    "seed": ("evaluate.py", ["--controllers", "idle", "--seed", "-1"], "from 0 to .*-1"),
     "n_epm 0": ("evaluate.py", ["--controllers", "idle", "--n-epm", "0"], "2 or 3.*0"),
     "n_epm 0 of the baseline": ("evaluate.py", ["--controllers", "baseline", "--n-epm", "0"], "n_epm.*0"),
     "n_epm 1": ("evaluate.py", ["--controllers", "idle", "--n-epm", "1"], "2 or 3.*1"),
     "control_hz": ("evaluate.py", ["--controllers", "idle", "--control-hz", "0"], "control_hz.*0.0"),
     "no model": ("evaluate.py", ["--controllers", "runs/nothing"], "model's folder.*'runs/nothing'"),
     "option": ("evaluate.py", ["--controler", "idle"], "--controler"),
-    "number": ("evaluate.py", ["--n-epm", "two"], "n-epm.*'two'"),
+    "number": ("evaluate.py", ["--n-epm", "two"], "n-epm must be a whole number; instead received 'two'"),
     "algorithm": ("train.py", ["--algo", "dqn"], "'dqn'.*ppo.*sac"),
     "train scenario": ("train.py", ["--scenario", "line"], "approach.*'line'"),
     "train plant": ("train.py", ["--plant", "moon"], "paper.*'moon'"),
     "train n_epm": ("train.py", ["--n-epm", "0"], "2 or 3.*0"),
     "train action": ("train.py", ["--action", "jump"], "'jump'.*home"),
-    "train steps": ("train.py", ["--steps", "0"], "positive.*0"),
+    "train steps": ("train.py", ["--steps", "0"], "error: Input steps must be a whole number of at least 1.*0"),
+    "train steps, words": ("train.py", ["--steps", "abc"], "steps must be a whole number; instead received 'abc'"),
+    "train seed": ("train.py", ["--seed", "-1"], "from 0 to 4294967295; instead received -1"),
+    "train gamma": ("train.py", ["--ppo.gamma", "2"], "error: Input gamma must be .* at most 1.*2"),
     "train net": ("train.py", ["--ppo.net", "0"], "widths.*0"),
+    "tune candidates": ("agents/tune.py", ["--candidates", "0"], "candidates.*at least 1.*0"),
     "train resume": ("train.py", ["--resume", "runs/nothing"], "checkpoints.*'runs/nothing'"),
 }
 
@@ -302,7 +321,7 @@ def test_a_foreign_model_is_refused(
 @pytest.mark.parametrize(
     ("error", "code", "line"),
     [
-        (ValueError("Input action must be finite; instead received [[nan\n 1.]]."), 2, r"error: .*\[\[nan 1\.\]\]\.\n"),
+        (InputError("Input action must be finite; instead received [[nan\n 1.]]."), 2, r"error: .*\[\[nan 1\.\]\]\.\n"),
         (OSError(28, "No space left on device", "/full"), 2, "error: .*No space left.*\n"),
         (KeyboardInterrupt(), 130, ""),
     ],
@@ -319,11 +338,12 @@ def test_an_end_by_error_is_told_in_one_line(
     assert re.fullmatch(line, capfd.readouterr().err)
 
 
-def test_a_fault_of_our_own_keeps_its_traceback() -> None:
+@pytest.mark.parametrize("kind", [RuntimeError, ValueError])
+def test_a_fault_of_our_own_keeps_its_traceback(kind: type[Exception]) -> None:
     def main() -> None:
-        raise RuntimeError("a fault")
+        raise kind("a fault")
 
-    with pytest.raises(RuntimeError, match="a fault"):
+    with pytest.raises(kind, match="a fault"):
         friendly(main)
 
 

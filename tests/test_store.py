@@ -21,9 +21,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.catalogue import controller, names
+from agents.checkpoints import save_model, stored_config
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import Learned
-from agents.learning import build, resumed, save_model
+from agents.learning import build
 from agents.store import (
     CARD,
     FORMAT,
@@ -255,7 +256,7 @@ def test_a_doctored_file_is_refused_and_runs_nothing(folder: Path, tmp_path: Pat
         one_line(lambda: Learned(folder))
         one_line(lambda: controller(str(folder)))
     if name == CARD:
-        one_line(lambda: resumed(TrainConfig(resume=tmp_path)))
+        one_line(lambda: stored_config(tmp_path))
     assert not canary.exists()
 
 
@@ -284,6 +285,7 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "negative net": lambda card: card.update(net=[-1, 8]),
     "net a text": lambda card: card.update(net="os"),
     "net a number": lambda card: card.update(net=64),
+    "a net of truths": lambda card: card.update(net=[True, True]),
     "fractional net": lambda card: card.update(net=[16.5, 8]),
     "steps a text": lambda card: card.update(steps="many"),
     "config a text": lambda card: card.update(config="none"),
@@ -336,6 +338,12 @@ FOREIGN: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
     "a mean not finite": with_value("observation.mean", torch.full((63,), math.inf, dtype=torch.float64)),
     "a variance not finite": with_value("observation.variance", torch.full((63,), math.nan, dtype=torch.float64)),
     "a negative variance": with_value("observation.variance", -torch.ones(63, dtype=torch.float64)),
+    "a mean in bfloat16": with_value("observation.mean", torch.zeros(63, dtype=torch.bfloat16)),
+    "weights in float8": with_value("policy.log_std", torch.zeros(10).to(torch.float8_e4m3fn)),
+    "complex weights": with_value("policy.log_std", torch.zeros(10, dtype=torch.complex64)),
+    "weights that overflow": lambda tensors: [
+        value.fill_(3e38) for name, value in tensors.items() if name.startswith("policy.")
+    ],
     "an empty count": with_value("observation.count", torch.zeros(0, dtype=torch.float64)),
     "a count not finite": with_value("observation.count", torch.tensor([math.nan], dtype=torch.float64)),
 }
