@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.allocation import best_of, component_scales
+from magenv.allocation import component_scales
 from magenv.home import home_epms, home_rows, start_rows
 from magenv.kernels import kernel
 from magenv.params import System, require
@@ -28,6 +28,7 @@ from magenv.poses import (
     project_epms,
     robots_frame,
 )
+from magenv.solver import best_of
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 

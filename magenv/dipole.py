@@ -58,7 +58,7 @@ def dipole_gradient(
     )
 
 
-@kernel
+@law
 def dipole_force_gradient(
     mx: float, my: float, mz: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -86,6 +86,54 @@ def dipole_force_gradient(
         k * (2.0 * my * ny + diagonal - 2.0 * ay * ry + c_rr * ry * ry),
         k * (my * nz + mz * ny - ay * rz - az * ry + c_rr * ry * rz),
         k * (2.0 * mz * nz + diagonal - 2.0 * az * rz + c_rr * rz * rz),
+    )
+
+
+@law
+def dipole_force_hessian(
+    ax: float,
+    ay: float,
+    az: float,
+    bx: float,
+    by: float,
+    bz: float,
+    cx: float,
+    cy: float,
+    cz: float,
+    rx: float,
+    ry: float,
+    rz: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Return c . d^2 F / dp_i dp_j as (xx, xy, xz, yy, yz, zz) in N/m^2 (c a pure number): F's second derivative.
+
+    F is the force on the dipole b at p by the source a. With the unit vector r and the sums over all pairings it is
+    -945 k / |r|^6 (r^5 - 1/9 sum_10 I r^3 + 1/63 sum_15 I I r) contracted with a, b and c, k = mu0 / (4 pi): the fifth
+    derivative of 1/|r|, symmetric in a, b, c and in i, j, traceless.
+    """
+    r2 = rx * rx + ry * ry + rz * rz
+    inverse_r2 = 1.0 / r2
+    k = -15.0 * _K * inverse_r2 * inverse_r2 * inverse_r2 * math.sqrt(inverse_r2)
+    a_r, b_r, c_r = ax * rx + ay * ry + az * rz, bx * rx + by * ry + bz * rz, cx * rx + cy * ry + cz * rz
+    a_b, a_c, b_c = ax * bx + ay * by + az * bz, ax * cx + ay * cy + az * cz, bx * cx + by * cy + bz * cz
+    seven, sixty_three = 7.0 * inverse_r2, 63.0 * inverse_r2 * inverse_r2
+    mixed = a_b * c_r + a_c * b_r + b_c * a_r
+    triple = a_r * b_r * c_r
+    r_r = sixty_three * triple - seven * mixed
+    diagonal = mixed - seven * triple
+    # What multiplies r in sym(r, v); the rest is sym of a, b, c among themselves.
+    on_a, on_b, on_c = b_c - seven * b_r * c_r, a_c - seven * a_r * c_r, a_b - seven * a_r * b_r
+    vx = on_a * ax + on_b * bx + on_c * cx
+    vy = on_a * ay + on_b * by + on_c * cy
+    vz = on_a * az + on_b * bz + on_c * cz
+    wx, wy, wz = a_r * bx + b_r * ax, a_r * by + b_r * ay, a_r * bz + b_r * az
+    ux, uy, uz = c_r * bx, c_r * by, c_r * bz
+    return (
+        k * (r_r * rx * rx + diagonal + 2.0 * (vx * rx + wx * cx + ux * ax)),
+        k * (r_r * rx * ry + vx * ry + vy * rx + wx * cy + wy * cx + ux * ay + uy * ax),
+        k * (r_r * rx * rz + vx * rz + vz * rx + wx * cz + wz * cx + ux * az + uz * ax),
+        k * (r_r * ry * ry + diagonal + 2.0 * (vy * ry + wy * cy + uy * ay)),
+        k * (r_r * ry * rz + vy * rz + vz * ry + wy * cz + wz * cy + uy * az + uz * ay),
+        k * (r_r * rz * rz + diagonal + 2.0 * (vz * rz + wz * cz + uz * az)),
     )
 
 

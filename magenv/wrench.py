@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.dipole import dipole_field, dipole_force_gradient, dipole_gradient
+from magenv.dipole import dipole_field, dipole_force_gradient, dipole_force_hessian, dipole_gradient
 from magenv.kernels import kernel, law
 from magenv.params import require
 from magenv.poses import POSE_SIZE, pose_to_epm
@@ -22,7 +22,7 @@ N_ROBOTS = 2
 WRENCH_SIZE = 10
 
 
-@kernel
+@law
 def dipole_wrench(
     sx: float, sy: float, sz: float, mx: float, my: float, mz: float, rx: float, ry: float, rz: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -68,53 +68,142 @@ def magnet_frame(moment: Floats, frame: Floats) -> None:
     frame[2, 0], frame[2, 1], frame[2, 2] = -z * yy, z * yx, x * yy - y * yx
 
 
-@kernel
-def _to_magnet_frame(frame: Floats, tau: Floats, force: Floats, out: Floats) -> None:
-    """Add the global torque and force, seen in the magnet frame, to ``out`` (5,)."""
-    for i in range(3):
-        out[0] += frame[1, i] * tau[i]
-        out[1] += frame[2, i] * tau[i]
-        out[2] += frame[0, i] * force[i]
-        out[3] += frame[1, i] * force[i]
-        out[4] += frame[2, i] * force[i]
-
-
-@kernel
-def _cross(a: Floats, bx: float, by: float, bz: float, out: Floats) -> None:
-    out[0] = a[1] * bz - a[2] * by
-    out[1] = a[2] * bx - a[0] * bz
-    out[2] = a[0] * by - a[1] * bx
-
-
-@kernel
+@law
 def _add_dipole(frame: Floats, source: Floats, target: Floats, r: Floats, out: Floats) -> None:
-    """Add the wrench of the moment ``source`` on ``target`` at offset ``r`` to ``out`` (5,)."""
-    tau, force = np.empty(3), np.empty(3)
-    tau[0], tau[1], tau[2], force[0], force[1], force[2] = dipole_wrench(
+    """Add the wrench of the moment ``source`` on ``target`` at offset ``r``, in the magnet frame, to ``out`` (5,)."""
+    tx, ty, tz, fx, fy, fz = dipole_wrench(
         source[0], source[1], source[2], target[0], target[1], target[2], r[0], r[1], r[2]
     )
-    _to_magnet_frame(frame, tau, force, out)
+    for i in range(2):
+        out[i] += frame[1 + i, 0] * tx + frame[1 + i, 1] * ty + frame[1 + i, 2] * tz
+    for i in range(3):
+        out[2 + i] += frame[i, 0] * fx + frame[i, 1] * fy + frame[i, 2] * fz
+
+
+@kernel
+def robot_frames(positions: Floats, moments: Floats, frames: Floats, mutual: Floats) -> None:
+    """Write what no EPM changes: the magnet frames (2, 3, 3) and the robots' mutual wrench (10)."""
+    r = np.empty(3)
+    mutual[:] = 0.0
+    for robot in range(N_ROBOTS):
+        other = 1 - robot
+        magnet_frame(moments[robot], frames[robot])
+        for i in range(3):
+            r[i] = positions[robot, i] - positions[other, i]
+        _add_dipole(frames[robot], moments[other], moments[robot], r, mutual[5 * robot : 5 * robot + 5])
+
+
+@law
+def epm_offset(positions: Floats, robot: int, epm: Floats, epm_moment: float, r: Floats, source: Floats) -> None:
+    """Write the offset (3,) of a robot from an EPM and the EPM's moment (3,)."""
+    for i in range(3):
+        r[i] = positions[robot, i] - epm[i]
+        source[i] = epm_moment * epm[3 + i]
+
+
+@kernel
+def add_epms(
+    positions: Floats, moments: Floats, frames: Floats, epms: Floats, epm_moment: float, work: Floats, wrench: Floats
+) -> None:
+    """Add the wrench of the EPMs (N, 6) on both robots to ``wrench`` (10); ``work`` (2, 3) is scratch."""
+    r, source = work[0], work[1]
+    for robot in range(N_ROBOTS):
+        for k in range(len(epms)):
+            epm_offset(positions, robot, epms[k], epm_moment, r, source)
+            _add_dipole(frames[robot], source, moments[robot], r, wrench[5 * robot : 5 * robot + 5])
 
 
 @kernel
 def wrench_kernel(positions: Floats, moments: Floats, pose: Floats, epm_moment: float, wrench: Floats) -> None:
     """Write U (10,) for robots at ``positions`` (2, 3) with ``moments`` (2, 3) under EPMs at ``pose`` (5 N)."""
-    frame, epm, r, source = np.empty((3, 3)), np.empty(6), np.empty(3), np.empty(3)
-    wrench[:] = 0.0
+    n = len(pose) // POSE_SIZE
+    frames, epms, work = np.empty((N_ROBOTS, 3, 3)), np.empty((n, 6)), np.empty((2, 3))
+    for k in range(n):
+        pose_to_epm(pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], epms[k])
+    robot_frames(positions, moments, frames, wrench)
+    add_epms(positions, moments, frames, epms, epm_moment, work, wrench)
+
+
+@kernel
+def wrench_gradients(
+    positions: Floats, moments: Floats, frames: Floats, epms: Floats, epm_moment: float, work: Floats, out: Floats
+) -> None:
+    """Write dU / d (centre, unit moment) of the EPMs (N, 6) into ``out`` (10, 6 N); ``work`` (2, 3) is scratch.
+
+    With the frame's axes x, y, z and n = |n| x the robot's moment, U = |n| (-z.B, y.B, x.Gx, y.Gx, z.Gx), and both B
+    and G = grad B are linear in the EPM's moment m by symmetric tensors: a.B(m) = m.B(a) and a.G(m) n = m.G(n) a.
+    """
+    r, s = work[0], work[1]
     for robot in range(N_ROBOTS):
-        out = wrench[5 * robot : 5 * robot + 5]
-        target = moments[robot]
-        magnet_frame(target, frame)
-        other = 1 - robot
-        for i in range(3):
-            r[i] = positions[robot, i] - positions[other, i]
-        _add_dipole(frame, moments[other], target, r, out)
-        for k in range(len(pose) // POSE_SIZE):
-            pose_to_epm(pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], epm)
+        n, frame = moments[robot], frames[robot]
+        size = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        for k in range(len(epms)):
+            epm_offset(positions, robot, epms[k], epm_moment, r, s)
+            gxx, gxy, gxz, gyy, gyz, gzz = dipole_gradient(s[0], s[1], s[2], r[0], r[1], r[2])
+            hxx, hxy, hxz, hyy, hyz, hzz = dipole_force_gradient(s[0], s[1], s[2], n[0], n[1], n[2], r[0], r[1], r[2])
+            lxx, lxy, lxz, lyy, lyz, lzz = dipole_gradient(n[0], n[1], n[2], r[0], r[1], r[2])
+            for i in range(2):  # torques about y and z: along -z and y; the offset falls as the centre rises
+                axis, sign = frame[2 - i], (-size if i == 0 else size)
+                ax, ay, az = sign * axis[0], sign * axis[1], sign * axis[2]
+                row = out[5 * robot + i, 6 * k : 6 * k + 6]
+                row[0] = -(gxx * ax + gxy * ay + gxz * az)
+                row[1] = -(gxy * ax + gyy * ay + gyz * az)
+                row[2] = -(gxz * ax + gyz * ay + gzz * az)
+                bx, by, bz = dipole_field(ax, ay, az, r[0], r[1], r[2])
+                row[3], row[4], row[5] = epm_moment * bx, epm_moment * by, epm_moment * bz
             for i in range(3):
-                r[i] = positions[robot, i] - epm[i]
-                source[i] = epm_moment * epm[3 + i]
-            _add_dipole(frame, source, target, r, out)
+                ax, ay, az = frame[i, 0], frame[i, 1], frame[i, 2]
+                row = out[5 * robot + 2 + i, 6 * k : 6 * k + 6]
+                row[0] = -(hxx * ax + hxy * ay + hxz * az)
+                row[1] = -(hxy * ax + hyy * ay + hyz * az)
+                row[2] = -(hxz * ax + hyz * ay + hzz * az)
+                row[3] = epm_moment * (lxx * ax + lxy * ay + lxz * az)
+                row[4] = epm_moment * (lxy * ax + lyy * ay + lyz * az)
+                row[5] = epm_moment * (lxz * ax + lyz * ay + lzz * az)
+
+
+@kernel
+def wrench_curvature(
+    positions: Floats,
+    moments: Floats,
+    frames: Floats,
+    epms: Floats,
+    epm_moment: float,
+    weights: Floats,
+    work: Floats,
+    out: Floats,
+) -> None:
+    """Write the second derivatives of ``weights`` (10) . U by the EPMs (N, 6) into ``out`` (N, 2, 6).
+
+    ``[k, 0]`` is by the centre twice, ``[k, 1]`` by centre and unit moment, both symmetric: (xx, xy, xz, yy, yz, zz).
+    By the moment twice it is zero, and so it is by two EPMs. ``work`` (2, 3) is scratch.
+    """
+    r, s = work[0], work[1]
+    out[:] = 0.0
+    for robot in range(N_ROBOTS):
+        n, f = moments[robot], frames[robot]
+        w = weights[5 * robot : 5 * robot + 5]
+        size = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        # weights . U = a.B + c.G n
+        ax, ay, az = (
+            size * (w[1] * f[1, 0] - w[0] * f[2, 0]),
+            size * (w[1] * f[1, 1] - w[0] * f[2, 1]),
+            size * (w[1] * f[1, 2] - w[0] * f[2, 2]),
+        )
+        cx, cy, cz = (
+            w[2] * f[0, 0] + w[3] * f[1, 0] + w[4] * f[2, 0],
+            w[2] * f[0, 1] + w[3] * f[1, 1] + w[4] * f[2, 1],
+            w[2] * f[0, 2] + w[3] * f[1, 2] + w[4] * f[2, 2],
+        )
+        for k in range(len(epms)):
+            epm_offset(positions, robot, epms[k], epm_moment, r, s)
+            twice = dipole_force_gradient(s[0], s[1], s[2], ax, ay, az, r[0], r[1], r[2])
+            third = dipole_force_hessian(s[0], s[1], s[2], n[0], n[1], n[2], cx, cy, cz, r[0], r[1], r[2])
+            once = dipole_gradient(ax, ay, az, r[0], r[1], r[2])
+            second = dipole_force_gradient(n[0], n[1], n[2], cx, cy, cz, r[0], r[1], r[2])
+            for i in range(6):
+                out[k, 0, i] += twice[i] + third[i]
+                out[k, 1, i] -= epm_moment * (once[i] + second[i])
 
 
 @kernel
@@ -133,45 +222,23 @@ def _pose_tangents(pose: Floats, position: Floats, moment: Floats) -> None:
 @kernel
 def jacobian_kernel(positions: Floats, moments: Floats, pose: Floats, epm_moment: float, jacobian: Floats) -> None:
     """Write dU/dpose (10, 5 N); the mutual wrench of the robots does not depend on the pose."""
-    frame, epm, r, source = np.empty((3, 3)), np.empty(6), np.empty(3), np.empty(3)
-    by_position, by_moment, tau, force, column = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty(3),
-        np.empty(5),
-    )
-    for k in range(len(pose) // POSE_SIZE):
-        block = pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE]
-        pose_to_epm(block, epm)
-        _pose_tangents(block, by_position, by_moment)
-        for robot in range(N_ROBOTS):
-            m = moments[robot]
-            magnet_frame(m, frame)
-            for i in range(3):
-                r[i] = positions[robot, i] - epm[i]
-                source[i] = epm_moment * epm[3 + i]
-            gxx, gxy, gxz, gyy, gyz, gzz = dipole_gradient(source[0], source[1], source[2], r[0], r[1], r[2])
-            hxx, hxy, hxz, hyy, hyz, hzz = dipole_force_gradient(
-                source[0], source[1], source[2], m[0], m[1], m[2], r[0], r[1], r[2]
-            )
-            for c in range(3):  # the EPM's centre: r moves the other way
-                x, y, z = -by_position[c, 0], -by_position[c, 1], -by_position[c, 2]
-                _cross(m, gxx * x + gxy * y + gxz * z, gxy * x + gyy * y + gyz * z, gxz * x + gyz * y + gzz * z, tau)
-                force[0] = hxx * x + hxy * y + hxz * z
-                force[1] = hxy * x + hyy * y + hyz * z
-                force[2] = hxz * x + hyz * y + hzz * z
-                column[:] = 0.0
-                _to_magnet_frame(frame, tau, force, column)
-                for i in range(5):
-                    jacobian[5 * robot + i, POSE_SIZE * k + c] = column[i]
-            for c in range(2):  # the EPM's moment: the wrench is linear in it
-                for i in range(3):
-                    source[i] = epm_moment * by_moment[c, i]
-                column[:] = 0.0
-                _add_dipole(frame, source, m, r, column)
-                for i in range(5):
-                    jacobian[5 * robot + i, POSE_SIZE * k + 3 + c] = column[i]
+    n = len(pose) // POSE_SIZE
+    frames, epms, work = np.empty((N_ROBOTS, 3, 3)), np.empty((n, 6)), np.empty((2, 3))
+    gradients, mutual = np.empty((WRENCH_SIZE, 6 * n)), np.empty(WRENCH_SIZE)
+    by_position, by_moment = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(n):
+        pose_to_epm(pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], epms[k])
+    robot_frames(positions, moments, frames, mutual)
+    wrench_gradients(positions, moments, frames, epms, epm_moment, work, gradients)
+    for k in range(n):
+        _pose_tangents(pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], by_position, by_moment)
+        for i in range(WRENCH_SIZE):
+            g = gradients[i, 6 * k : 6 * k + 6]
+            row = jacobian[i, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE]
+            for c in range(3):
+                row[c] = g[0] * by_position[c, 0] + g[1] * by_position[c, 1] + g[2] * by_position[c, 2]
+            for c in range(2):
+                row[3 + c] = g[3] * by_moment[c, 0] + g[4] * by_moment[c, 1] + g[5] * by_moment[c, 2]
 
 
 @kernel

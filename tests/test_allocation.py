@@ -109,7 +109,7 @@ def test_a_miss_is_a_local_minimum(seed: int, n_epm: int) -> None:
     """SciPy's SLSQP, begun at the solution, must not find anything better by more than 0.1 %."""
     problem = unreachable(seed, n_epm)
     target, positions, moments, system = problem
-    solution = allocate(*problem, seed=seed, max_iterations=3000)
+    solution = allocate(*problem, seed=seed)
     scale = 1 / SCALES / np.linalg.norm(target / SCALES)
 
     def error(pose: Floats) -> Floats:
@@ -134,18 +134,14 @@ def test_a_miss_is_a_local_minimum(seed: int, n_epm: int) -> None:
         options={"maxiter": 300, "ftol": 1e-13},
     )
     assert squared_gaps(polished.x).min() > -1e-6
-    # Along the flat valleys of three EPMs Gauss-Newton creeps, and may rest a little early.
-    slack = 1e-3 if n_epm == 2 else 0.02
-    assert solution.relative_residual <= np.sqrt(2 * polished.fun) * (1 + slack)
+    assert solution.relative_residual <= np.sqrt(2 * polished.fun) * (1 + 1e-3)
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])
 def test_a_miss_is_told_as_stationary(n_epm: int) -> None:
     """The iterations are enough to find most minima: the status says so."""
-    statuses = [
-        allocate(*unreachable(seed, n_epm), seed=seed, starts=3, max_iterations=3000).status for seed in range(8)
-    ]
-    assert statuses.count("stationary") >= 6
+    statuses = [allocate(*unreachable(seed, n_epm), seed=seed, starts=3).status for seed in range(8)]
+    assert statuses.count("stationary") == 8
 
 
 @pytest.mark.filterwarnings("ignore:delta_grad == 0.0:UserWarning")
@@ -224,7 +220,8 @@ def test_early_stop_spares_the_rest_and_meets_the_target() -> None:
 def test_more_starts_are_never_worse() -> None:
     problem = unreachable(3, 2)
     residuals = [allocate(*problem, seed=2, starts=k).relative_residual for k in (1, 3, 10)]
-    assert residuals == sorted(residuals, reverse=True)
+    assert residuals[1] <= residuals[0] * (1 + 1e-6)
+    assert residuals[2] <= residuals[1] * (1 + 1e-6)
 
 
 def test_iteration_limit_holds() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magenv.dipole import dipole_force_gradient, field, gradient
+from magenv.dipole import dipole_force_gradient, dipole_force_hessian, field, gradient
 from magenv.params import MU_0, Magnet, System
 
 Floats = NDArray[np.float64]
@@ -212,3 +212,17 @@ def test_moment_is_that_of_the_polarised_cylinder() -> None:
     cylinder = magpylib.magnet.Cylinder(dimension=(5e-3, 5e-3), polarization=(0, 0, magnet.remanence_t))
     far = np.array([0.1, 0.2, 2.0])
     np.testing.assert_allclose(field([0, 0, magnet.moment_am2], [0, 0, 0], far), cylinder.getB(far), rtol=1e-5)
+
+
+def test_force_hessian_is_the_derivative_of_the_force_gradient(rng: np.random.Generator) -> None:
+    h = 1e-5
+    for _ in range(20):
+        a, b, c, r = rng.normal(size=(4, 3))
+        exact = np.array(dipole_force_hessian(*a, *b, *c, *r))
+        ahead, behind = (np.array(dipole_force_gradient(*a, *b, *(r + s * h * c))) for s in (1, -1))
+        np.testing.assert_allclose(exact, (ahead - behind) / (2 * h), atol=1e-6 * np.abs(exact).max())
+        assert abs(exact[0] + exact[3] + exact[5]) < 1e-13 * np.abs(exact).max()
+        for x, y, z in ((b, a, c), (c, b, a), (a, c, b)):
+            np.testing.assert_allclose(
+                dipole_force_hessian(*x, *y, *z, *r), exact, rtol=1e-9, atol=1e-13 * np.abs(exact).max()
+            )

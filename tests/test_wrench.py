@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from magenv.dipole import field, gradient
 from magenv.params import System
 from magenv.poses import from_cartesian, pose_bounds, to_cartesian
-from magenv.wrench import dipole_wrench, magnet_frame, planar_moments, robot_wrench, wrench_jacobian
+from magenv.wrench import (
+    dipole_wrench,
+    magnet_frame,
+    planar_moments,
+    robot_frames,
+    robot_wrench,
+    wrench_curvature,
+    wrench_gradients,
+    wrench_jacobian,
+)
 
 Floats = NDArray[np.float64]
 
@@ -195,3 +204,32 @@ def test_planar_moments() -> None:
     m = planar_moments([[0.0, np.pi / 2], [np.pi, -0.3]], 2.0)
     expected = 2 * np.array([[[1, 0, 0], [0, 1, 0]], [[-1, 0, 0], [np.cos(0.3), -np.sin(0.3), 0]]])
     np.testing.assert_allclose(m, expected, atol=1e-15)
+
+
+def test_curvature_is_the_derivative_of_the_gradients(rng: np.random.Generator) -> None:
+    positions, moments, pose = scene(rng, 2)
+    centres, directions = to_cartesian(pose)
+    epms, weights = np.concatenate([centres, directions], axis=-1), rng.normal(size=10)
+    frames, mutual, work, curvature = np.empty((2, 3, 3)), np.empty(10), np.empty((2, 3)), np.empty((2, 2, 6))
+    robot_frames(positions, moments, frames, mutual)
+    wrench_curvature(positions, moments, frames, epms, EPM, weights, work, curvature)
+
+    def slope(moved: Floats) -> Floats:
+        gradients = np.empty((10, 12))
+        wrench_gradients(positions, moments, frames, moved, EPM, work, gradients)
+        return weights @ gradients
+
+    h = 1e-6
+    exact, numeric = np.zeros((12, 12)), np.empty((12, 12))
+    for k in range(2):
+        twice, mixed = (
+            curvature[k, i][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]  # (xx, xy, xz, yy, yz, zz) as a matrix
+            for i in range(2)
+        )
+        at = slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)
+        exact[at[0], at[0]], exact[at[0], at[1]], exact[at[1], at[0]] = twice, mixed, mixed
+        for i in range(6):
+            step = np.zeros((2, 6))
+            step[k, i] = h
+            numeric[6 * k + i] = (slope(epms + step) - slope(epms - step)) / (2 * h)
+    np.testing.assert_allclose(exact, numeric, atol=1e-7 * np.abs(exact).max())

@@ -1,0 +1,90 @@
+"""What ``magenv.allocation`` takes in: checked arrays, and the random starts."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magenv.kernels import kernel
+from magenv.params import System, require
+from magenv.poses import POSE_SIZE, pose_bounds
+from magenv.wrench import WRENCH_SIZE
+
+Floats = NDArray[np.float64]
+
+
+def random_starts(system: System, starts: int, rng: np.random.Generator) -> Floats:
+    """Draw pose vectors (starts, 5 N) uniformly within their bounds."""
+    low, high = pose_bounds(system)
+    return rng.uniform(low, high, size=(starts, len(low)))
+
+
+@lru_cache(maxsize=16)
+def _seeded_starts(system: System, starts: int, seed: int) -> Floats:
+    """Return ``random_starts`` of a seed: drawing them takes longer than a warm start."""
+    drawn = random_starts(system, starts, np.random.default_rng(seed))
+    drawn.flags.writeable = False
+    return drawn
+
+
+@kernel
+def _all_finite(values: Floats) -> bool:
+    finite = True
+    for value in values:
+        finite = finite and math.isfinite(value)
+    return finite
+
+
+@kernel
+def _least_size(first: Floats, second: Floats) -> float:
+    """Return the least squared length of ``first`` - ``second``, rows (n, 3)."""
+    least = math.inf
+    for i in range(len(first)):
+        squared = 0.0
+        for k in range(3):
+            squared += (first[i, k] - second[i, k]) ** 2
+        least = min(least, squared)
+    return least
+
+
+def _finite(name: str, value: ArrayLike, own: tuple[int, ...], leading: bool) -> Floats:
+    """Return ``value`` as a finite array of shape ``own``, or (..., *own) where leading axes are allowed."""
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    axes = array.ndim - len(own)
+    fits = axes >= 0 and array.shape[axes:] == own and (leading or axes == 0)
+    require(fits, name, f"an array of shape {('...', *own) if leading else own}", array.shape)
+    if not _all_finite(array.reshape(-1)):
+        require(False, name, "finite", array.tolist())
+    return array
+
+
+def checked_problem(
+    target: ArrayLike,
+    positions: ArrayLike,
+    moments: ArrayLike,
+    initial: ArrayLike | None,
+    system: System,
+    leading: bool,
+) -> tuple[Floats, Floats, Floats, Floats | None]:
+    """Return the checked target, positions, moments and initial pose."""
+    u_d = _finite("target", target, (WRENCH_SIZE,), leading)
+    p, m = _finite("positions", positions, (2, 3), leading), _finite("moments", moments, (2, 3), leading)
+    pairs, rows = p.reshape(-1, 2, 3), m.reshape(-1, 3)
+    if not _least_size(pairs[:, 0], pairs[:, 1]) > 0.0:
+        require(False, "positions", "of two robots apart from each other", p.tolist())
+    if not _least_size(rows, np.zeros_like(rows)) > 0.0:
+        require(False, "moments", "other than zero", m.tolist())
+    first = None if initial is None else _finite("initial", initial, (POSE_SIZE * system.n_epm,), leading)
+    return u_d, p, m, first
+
+
+def draw_starts(system: System, starts: int, seed: int | np.random.Generator, warm: bool) -> Floats:
+    """Return the random starts (starts, 5 N)."""
+    enough = isinstance(starts, int) and starts >= (0 if warm else 1)
+    require(enough, "starts", "a whole number of at least 1 (0 with an initial pose)", starts)
+    if isinstance(seed, int):
+        return _seeded_starts(system, starts, seed)
+    return random_starts(system, starts, np.random.default_rng(seed))
