@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from magenv.allocation_input import checked_problem, draw_starts
 from magenv.allocation_scipy import trust_constr
 from magenv.kernels import kernel
-from magenv.params import System, require
+from magenv.params import System, common_shape, require
 from magenv.solver import best_of
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
@@ -280,7 +280,7 @@ def allocate_batch(
     scale = _weights(force_scale_n, torque_scale_nm)
     drawn = draw_starts(system, starts, seed, first is not None)
     warm = np.empty(0) if first is None else first
-    shape = np.broadcast_shapes(u_d.shape[:-1], p.shape[:-2], m.shape[:-2], warm.shape[:-1])
+    shape = common_shape(target=u_d.shape[:-1], positions=p.shape[:-2], moments=m.shape[:-2], initial=warm.shape[:-1])
     own = ((WRENCH_SIZE,), (2, 3), (2, 3), warm.shape[-1:])
     u_d, p, m, warm = (
         np.ascontiguousarray(np.broadcast_to(value, shape + end)).reshape(math.prod(shape), *end)

@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magenv.kernels import kernel
-from magenv.params import System, require
+from magenv.params import System, is_whole, require
 from magenv.poses import POSE_SIZE, pose_bounds
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
+
+_MOST = 1e9
+"""Size of any number taken in, SI units: far beyond all magnets, far from what overflows."""
 
 
 def random_starts(system: System, starts: int, rng: np.random.Generator) -> Floats:
@@ -31,11 +34,11 @@ def _seeded_starts(system: System, starts: int, seed: int) -> Floats:
 
 
 @kernel
-def _all_finite(values: Floats) -> bool:
-    finite = True
+def _all_within(values: Floats, most: float) -> bool:
+    within = True
     for value in values:
-        finite = finite and math.isfinite(value)
-    return finite
+        within = within and abs(value) <= most  # false for NaN
+    return within
 
 
 @kernel
@@ -51,13 +54,13 @@ def _least_size(first: Floats, second: Floats) -> float:
 
 
 def _finite(name: str, value: ArrayLike, own: tuple[int, ...], leading: bool) -> Floats:
-    """Return ``value`` as a finite array of shape ``own``, or (..., *own) where leading axes are allowed."""
+    """Return ``value`` as an array of sane numbers of shape ``own``, or (..., *own) where leading axes are allowed."""
     array = np.ascontiguousarray(value, dtype=np.float64)
     axes = array.ndim - len(own)
     fits = axes >= 0 and array.shape[axes:] == own and (leading or axes == 0)
     require(fits, name, f"an array of shape {('...', *own) if leading else own}", array.shape)
-    if not _all_finite(array.reshape(-1)):
-        require(False, name, "finite", array.tolist())
+    if not _all_within(array.reshape(-1), _MOST):
+        require(False, name, f"finite, of at most {_MOST:g} in size", array.tolist())
     return array
 
 
@@ -83,8 +86,9 @@ def checked_problem(
 
 def draw_starts(system: System, starts: int, seed: int | np.random.Generator, warm: bool) -> Floats:
     """Return the random starts (starts, 5 N)."""
-    enough = isinstance(starts, int) and starts >= (0 if warm else 1)
+    enough = is_whole(starts) and starts >= (0 if warm else 1)
     require(enough, "starts", "a whole number of at least 1 (0 with an initial pose)", starts)
-    if isinstance(seed, int):
-        return _seeded_starts(system, starts, seed)
-    return random_starts(system, starts, np.random.default_rng(seed))
+    if isinstance(seed, np.random.Generator):
+        return random_starts(system, starts, seed)
+    require(is_whole(seed) and seed >= 0, "seed", "a whole number of at least 0 or a numpy Generator", seed)
+    return _seeded_starts(system, starts, int(seed))

@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 
+import numpy as np
+
 MU_0 = 4e-7 * math.pi
 """Vacuum permeability in H/m, the value of the paper."""
 
@@ -22,6 +24,17 @@ def require(condition: bool, name: str, must_be: str, received: object) -> None:
     """Raise ``InputError`` in the one form used for all bad input of this package."""
     if not condition:
         raise InputError(f"Input {name} must be {must_be}; instead received {received!r}.")
+
+
+def common_shape(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape to which named shapes broadcast, or raise ``InputError``."""
+    try:
+        return np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        names, received = ", ".join(shapes), list(shapes.values())
+        raise InputError(
+            f"Input {names} must be of leading axes that broadcast; instead received {received}."
+        ) from None
 
 
 def _is_number(value: object) -> bool:

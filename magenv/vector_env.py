@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
 from magenv.episodes import Bools, Episodes, Settings, check_action
-from magenv.params import require
+from magenv.params import is_whole, require
 from magenv.render import RENDER_FPS, Renderer
 from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
@@ -82,20 +82,21 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
     ) -> tuple[Observations, dict[str, Any]]:
         """Begin episodes, in all rows or where ``options["reset_mask"]`` says; row i takes seed + i, or the i-th."""
         seeds: list[int | None] = [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif isinstance(seed, (list, tuple)):
-            seeds = list(seed)
-        fits = seed is None or isinstance(seed, (int, np.integer, list, tuple))
-        require(fits and len(seeds) == self.num_envs, "seed", f"a whole number or {self.num_envs} of them", seed)
+        if is_whole(seed):
+            seeds = [int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
+        elif seed is not None:
+            seeds = list(seed) if isinstance(seed, (list, tuple, np.ndarray)) else []
+        fits = len(seeds) == self.num_envs and all(s is None or (is_whole(s) and s >= 0) for s in seeds)
+        require(fits, "seed", f"a whole number of at least 0, or {self.num_envs} of them", seed)
         mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
             fits = mask.shape == (self.num_envs,) and mask.dtype == np.bool_ and bool(mask.any())
             require(fits, "reset_mask", f"{self.num_envs} booleans, one of them true", options["reset_mask"])
-        for row in np.flatnonzero(mask):
-            if seeds[row] is not None:
-                self._episodes.seed(int(row), seeding.np_random(seeds[row])[0])
+        for row in np.flatnonzero(mask).tolist():
+            own = seeds[row]
+            if own is not None:
+                self._episodes.seed(row, seeding.np_random(int(own))[0])
         self._start(mask)
         return self._episodes.observe(), _masked(self._episodes.state_info(), mask)
 

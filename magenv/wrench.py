@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magenv.dipole import dipole_field, dipole_force_gradient, dipole_force_hessian, dipole_gradient
 from magenv.kernels import kernel, law
-from magenv.params import require
+from magenv.params import common_shape, require
 from magenv.poses import POSE_SIZE, pose_to_epm
 
 Floats = NDArray[np.float64]
@@ -266,7 +266,7 @@ def _rows(
         x.shape,
     )
     require(math.isfinite(epm_moment_am2) and epm_moment_am2 > 0, "epm_moment_am2", "a positive number", epm_moment_am2)
-    shape = np.broadcast_shapes(p.shape[:-2], m.shape[:-2], x.shape[:-1])
+    shape = common_shape(positions=p.shape[:-2], moments=m.shape[:-2], pose=x.shape[:-1])
     return (
         shape,
         np.ascontiguousarray(np.broadcast_to(p, (*shape, 2, 3)).reshape(-1, 2, 3)),

@@ -206,13 +206,20 @@ def test_seed_of_the_env_is_gymnasiums_matter(make_env: MakeEnv, seed: Any) -> N
     assert env.reset(seed=0)[0] in env.observation_space
 
 
-@pytest.mark.parametrize("seed", [[1], [1, 2, 3], [1, -1], 1.5, "ab"])
+@pytest.mark.parametrize("seed", [[1], [1, 2, 3], [1, -1], -1, 1.5, "ab", True])
 def test_seeds_of_a_batch(seed: Any) -> None:
-    env = TwoRobotsVector(2)
-    env.reset(seed=4)
-    with pytest.raises((ValueError, gymnasium.error.Error), match=r"[Ss]eed"):
+    env, other = TwoRobotsVector(2), TwoRobotsVector(2)
+    for batch in (env, other):
+        batch.reset(seed=4)
+    with pytest.raises(ValueError, match=told("seed", "a whole number of at least 0, or 2 of them", seed)):
         env.reset(seed=seed)
-    assert env.reset(seed=4)[0] in env.observation_space
+    np.testing.assert_array_equal(env.reset()[0], other.reset()[0], "no generator was replaced")
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), np.arange(3, 5), [np.uint8(3), np.int64(4)], (3, 4)])
+def test_seeds_of_a_batch_may_be_numpys(seed: Any) -> None:
+    one, other = TwoRobotsVector(2).reset(seed=seed)[0], TwoRobotsVector(2).reset(seed=3)[0]
+    np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("mask", [[True], [False, False], [1, 0], np.ones((2, 1), bool), "ab"])
@@ -226,7 +233,7 @@ def test_reset_mask(mask: Any) -> None:
 # Parameters
 
 
-@pytest.mark.parametrize("value", [0.0, -0.01, math.nan, math.inf])
+@pytest.mark.parametrize("value", [0.0, -0.01, math.nan, math.inf, "1", None, True])
 @pytest.mark.parametrize("name", ["mass_kg", "inertia_kgm2", "diameter_m"])
 def test_body_is_positive(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=told(name, POSITIVE, value)):
@@ -246,6 +253,12 @@ def test_drag_is_not_negative(name: str, value: float) -> None:
 def test_magnet_is_positive(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=told(name, POSITIVE, value)):
         Magnet(**({"diameter_m": 0.1, "length_m": 0.1} | {name: value}))
+
+
+def test_numpys_numbers_are_numbers() -> None:
+    assert System(n_epm=np.int64(3)).gap_min_m == System(n_epm=3).gap_min_m  # type: ignore[arg-type]
+    assert TaskParams(control_hz=np.float32(4)).period_s == 0.25  # type: ignore[arg-type]
+    TwoRobots(n_epm=np.int64(2), control_hz=np.float64(2.0)).reset(seed=0)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.0, True, "2", None])
@@ -322,6 +335,8 @@ def test_wrench_shapes() -> None:
         for bad in (pose[:4], pose[:0], np.array(1.0)):
             with pytest.raises(ValueError, match=told("pose", "an array of shape (..., 5 N)", bad.shape)):
                 law(positions, moments, bad, 1.0)
+        with pytest.raises(ValueError, match=r"^Input positions, moments, pose must be of leading axes that broadcast"):
+            law(np.tile(positions, (2, 1, 1)), np.tile(moments, (3, 1, 1)), pose, 1.0)
         for value in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(ValueError, match=told("epm_moment_am2", "a positive number", value)):
                 law(positions, moments, pose, value)
@@ -363,6 +378,9 @@ def problem(**changes: Any) -> dict[str, Any]:
     [
         ({"target": np.zeros(6)}, "target"),
         ({"target": np.full(10, np.nan)}, "target"),
+        ({"target": np.full(10, 1e160)}, "target"),
+        ({"seed": -1}, "seed"),
+        ({"seed": "a"}, "seed"),
         ({"positions": np.zeros((2, 2))}, "positions"),
         ({"positions": np.full((2, 3), np.inf)}, "positions"),
         ({"positions": np.zeros((2, 3))}, "positions"),  # coincident robots
