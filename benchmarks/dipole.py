@@ -1,20 +1,54 @@
-"""Dipole field and gradient, against magpylib and against what the core can do at most."""
+"""Dipole field and gradient, against magpylib and against what core and memory can do at most."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.measure import EXTRA, Contestant, Effort, installed, side_by_side
 from benchmarks.peak import multiply_adds
-from benchmarks.table import LeftOut, Limit, Line, Row
-from magenv.dipole import field, gradient
+from benchmarks.table import LeftOut, Limit, Line, Row, text
+from magenv.dipole import dipole_field, dipole_gradient, field, field_and_gradient
 
 TITLE = "Dipole"
 
 FLOPS = 61
 """Floating point operations of field and gradient of one pair, a division and a square root among them."""
+BYTES = 8 * (3 + 3 + 3 + 9)
+"""What field and gradient of one pair read (moment, point; all have one source) and write."""
+CALLS = 20
+"""Calls in a turn: a single one would measure the caches that the contestant before has left."""
+BLOCKS, LANES = 8, 32
+"""Pairs that stay in the nearest cache."""
+
+
+@numba.njit(error_model="numpy", nogil=True)
+def _in_cache(loops: int, blocks: NDArray[np.float64]) -> None:
+    """Compute field and gradient in blocks (any, 15, ``LANES``) again and again: the laws without their arrays.
+
+    Rows 0 to 2 of a block are the moments, 3 to 5 the offsets, the rest results. IEEE arithmetic, as in the product.
+    """
+    for _ in range(loops):
+        for k in range(len(blocks)):
+            b = blocks[k]
+            for i in range(LANES):
+                mx, my, mz, rx, ry, rz = b[0, i], b[1, i], b[2, i], b[3, i], b[4, i], b[5, i]
+                b[6, i], b[7, i], b[8, i] = dipole_field(mx, my, mz, rx, ry, rz)
+                xx, xy, xz, yy, yz, zz = dipole_gradient(mx, my, mz, rx, ry, rz)
+                b[9, i], b[10, i], b[11, i], b[12, i], b[13, i], b[14, i] = xx, xy, xz, yy, yz, zz
+
+
+def _calls(call: Callable[[], object], units: int) -> Contestant:
+    """Return a contestant that makes ``CALLS`` calls of so many units each."""
+
+    def run() -> None:
+        for _ in range(CALLS):
+            call()
+
+    return Contestant(run, CALLS * units)
 
 
 def measure(effort: Effort) -> Iterator[Line]:
@@ -23,20 +57,20 @@ def measure(effort: Effort) -> Iterator[Line]:
     rng = np.random.default_rng(0)
     moments, offsets = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
     source = np.zeros(3)
-
-    def both() -> None:
-        field(moments, source, offsets)
-        gradient(moments, source, offsets)
-
+    blocks, loops = rng.normal(size=(BLOCKS, 15, LANES)), 1 + CALLS * n // (BLOCKS * LANES)
+    read = np.ones(BYTES * n // 16)
+    written = np.empty_like(read)
     contestants = {
-        "field": Contestant(lambda: field(moments, source, offsets), n),
-        "field and gradient": Contestant(both, n),
+        "field": _calls(lambda: field(moments, source, offsets), n),
+        "field and gradient": _calls(lambda: field_and_gradient(moments, source, offsets), n),
+        "in cache": Contestant(lambda: _in_cache(loops, blocks), loops * BLOCKS * LANES),
+        "copy": _calls(lambda: np.copyto(written, read), 16 * len(read)),
         "peak": multiply_adds(1),
     }
     if installed("magpylib"):
         from magpylib.core import dipole_Hfield
 
-        contestants["magpylib"] = Contestant(lambda: dipole_Hfield(offsets, moments), n)
+        contestants["magpylib"] = _calls(lambda: dipole_Hfield(offsets, moments), n)
     else:
         yield LeftOut("magpylib", f"magpylib is not installed: {EXTRA}")
     times = side_by_side(contestants, effort.repeats)
@@ -46,7 +80,15 @@ def measure(effort: Effort) -> Iterator[Line]:
             theirs, ratio = times.rate("magpylib"), times.speedup(name, "magpylib")
             peer = "magpylib.core, field alone"
             yield Row(f"{name}, {pairs}", times.rate(name), "pairs/s", peer, theirs, ratio, Limit(15.0))
-    share = FLOPS * times.speedup("field and gradient", "peak")
-    flops, peak = FLOPS * times.rate("field and gradient"), times.rate("peak")
-    note = f"{FLOPS} flops a pair"
-    yield Row(f"field and gradient, {pairs}", flops, "flop/s", "peak of one core", peak, share, Limit(0.35), note)
+    peak, wanted = times.rate("peak"), Limit(0.35)
+    for name, where, note in (
+        ("field and gradient", pairs, f"{FLOPS} flops a pair; bound by memory, see below"),
+        ("in cache", "in cache", f"{FLOPS} flops a pair; the laws without reading and writing arrays"),
+    ):
+        flops, share = FLOPS * times.rate(name), FLOPS * times.speedup(name, "peak")
+        yield Row(f"field and gradient, {where}", flops, "flop/s", "peak of one core", peak, share, wanted, note)
+    moved, share = BYTES * times.rate("field and gradient"), BYTES * times.speedup("field and gradient", "copy")
+    bound = FLOPS / BYTES * float(np.median(times.of["peak"] / times.of["copy"]))
+    note = f"{BYTES} bytes a pair; at the copy's rate {text(bound, 'x')} of the peak would be reached"
+    copy = "copy of as many bytes"
+    yield Row(f"field and gradient, {pairs}, memory", moved, "B/s", copy, times.rate("copy"), share, note=note)

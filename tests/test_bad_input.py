@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import magenv
 from magenv.actions import ActionMode, Actions
 from magenv.allocation import allocate
-from magenv.dipole import field, gradient
+from magenv.dipole import field, field_and_gradient, gradient
 from magenv.env import TwoRobots
 from magenv.params import Body, Magnet, Plant, System, TaskParams
 from magenv.poses import from_cartesian, home_pose, project, to_cartesian
@@ -315,7 +315,8 @@ def test_start_spread_is_not_negative(name: str) -> None:
 
 
 def test_dipole_shapes() -> None:
-    for law in (field, gradient):
+    laws: list[Callable[..., object]] = [field, gradient, field_and_gradient]
+    for law in laws:
         for name, arguments in (
             ("moment", ([1, 2], [0, 0, 0], [1, 0, 0])),
             ("source", ([1, 0, 0], [0, 0, 0, 0], [1, 0, 0])),

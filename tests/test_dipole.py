@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import platform
+import re
+from typing import Any
+
 import magpylib
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magenv.dipole import dipole_force_gradient, dipole_force_hessian, field, gradient
+from magenv.dipole import (
+    _rows_kernel,
+    dipole_force_gradient,
+    dipole_force_hessian,
+    field,
+    field_and_gradient,
+    gradient,
+)
 from magenv.params import MU_0, Magnet, System
 
 Floats = NDArray[np.float64]
@@ -152,6 +164,77 @@ def test_arguments_broadcast() -> None:
     assert field([1, 0, 0], [0, 0, 0], [1, 0, 0]).shape == (3,)
     assert field(np.ones((0, 3)), a, [1, 0, 0]).shape == (0, 3)
     np.testing.assert_array_equal(field(m, a, b)[2, 3], field([1, 1, 1], a, b[0]))
+
+
+def test_fields_of_shapes_that_do_not_broadcast_are_refused() -> None:
+    with pytest.raises(ValueError, match="shape mismatch"):
+        field_and_gradient(np.ones((2, 3)), np.zeros((4, 3)), np.ones(3))
+
+
+def same_bits(moments: Any, sources: Any, points: Any, b: Floats, g: Floats) -> bool:
+    """Whether all three functions give exactly these fields and gradients, NaN included."""
+    both = field_and_gradient(moments, sources, points)
+    found = (field(moments, sources, points), gradient(moments, sources, points), *both)
+    return all(
+        one.shape == two.shape and one.tobytes() == two.tobytes() for one, two in zip(found, (b, g, b, g), strict=True)
+    )
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 31, 32, 33, 64, 200])
+def test_bits_do_not_depend_on_how_many_rows_there_are(dipoles: tuple[Floats, Floats, Floats], n: int) -> None:
+    """Blocks, the rest after them and single rows; the laws as they stand, too."""
+    b, g = field_and_gradient(*dipoles)
+    assert same_bits(*(value[:n] for value in dipoles), b[:n], g[:n])
+    for row in range(n):
+        assert same_bits(*(value[row] for value in dipoles), b[row], g[row])
+
+
+def test_one_row_serves_for_many(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    for which in range(3):
+        few = [value[:1] if i == which else value for i, value in enumerate(dipoles)]
+        b, g = field_and_gradient(*(np.ascontiguousarray(np.broadcast_to(value, (200, 3))) for value in few))
+        for one in (few[which], few[which][0], few[which][None]):
+            arguments = [one if i == which else value for i, value in enumerate(few)]
+            lead = (1,) if one.ndim == 3 else ()
+            assert same_bits(*arguments, b.reshape(*lead, 200, 3), g.reshape(*lead, 200, 3, 3))
+
+
+def test_bits_do_not_depend_on_how_arrays_lie_in_memory(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    expected = field_and_gradient(*dipoles)
+    spread = np.zeros((200, 6))
+    spread[:, ::2] = moments
+    assert same_bits(spread[:, ::2], np.asfortranarray(sources), points[::-1][::-1], *expected)
+    odd = np.frombuffer(b"x" + points.tobytes(), offset=1).reshape(200, 3)  # neither aligned nor writeable
+    assert same_bits(moments, sources, odd, *expected)
+    assert same_bits(moments.tolist(), sources, points, *expected)
+    swapped = (np.swapaxes(value.reshape(20, 10, 3), 0, 1) for value in dipoles)
+    b, g = expected[0].reshape(20, 10, 3), expected[1].reshape(20, 10, 3, 3)
+    assert same_bits(*swapped, np.swapaxes(b, 0, 1), np.swapaxes(g, 0, 1))
+
+
+def test_nan_in_a_row_never_touches_its_neighbours(dipoles: tuple[Floats, Floats, Floats]) -> None:
+    moments, sources, points = dipoles
+    b, g = field_and_gradient(*dipoles)
+    moments[7], points[40], sources[199] = np.nan, sources[40], np.inf
+    sick = field_and_gradient(*dipoles)
+    others = np.isin(np.arange(200), [7, 40, 199], invert=True)
+    assert np.isnan(sick[0][~others]).all()
+    assert np.isnan(sick[1][~others]).all()
+    np.testing.assert_array_equal(sick[0][others], b[others])
+    np.testing.assert_array_equal(sick[1][others], g[others])
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+@pytest.mark.parametrize("what", [(True, False), (False, True), (True, True)])
+def test_rows_are_vectorised(what: tuple[bool, bool]) -> None:
+    """Compiled here: numba does not show cached code."""
+    cached: Any = _rows_kernel(*what)
+    fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
+    fresh(1, *np.ones((3, 3)), np.empty(3), np.empty(9))
+    (assembly,) = fresh.inspect_asm().values()
+    assert re.search(r"\bv?divpd\b", assembly)
+    assert re.search(r"\bv?sqrtpd\b", assembly)
 
 
 def test_laws_are_nan_at_the_source() -> None:
