@@ -41,11 +41,11 @@ class TwoRobotsVecEnv(VecEnv):
             if seed is not None:
                 self._episodes.seed(row, seeding.np_random(seed)[0])
         self._reset_seeds()
-        self._begin(self._all)
-        return self._episodes.observe()
+        self._forget(self._all)
+        return self._episodes.start(self._all)
 
-    def _begin(self, mask: NDArray[np.bool_]) -> None:
-        self._episodes.start(mask)
+    def _forget(self, mask: NDArray[np.bool_]) -> None:
+        """Begin sums of new episodes where ``mask`` says."""
         self._sums[:, mask] = 0.0
         self._lengths[mask] = 0
 
@@ -57,29 +57,31 @@ class TwoRobotsVecEnv(VecEnv):
         """Step all episodes."""
         episodes = self._episodes
         actions = check_action(self._actions, (self.num_envs, episodes.actions.size))
-        rewards, terminated, truncated = episodes.step(actions, self._all)
+        observations = episodes.step(actions, self._all)
+        rewards, terminated, truncated = episodes.outcome()
         measured = episodes.world.measurements
-        for total, value in zip(self._sums, (*(getattr(measured, key) for key in EPISODE_KEYS), rewards), strict=True):
-            total += value
+        for sums, values in zip(self._sums, (*(getattr(measured, key) for key in EPISODE_KEYS), rewards), strict=True):
+            sums += values
         self._lengths += 1
-        observations = episodes.observe()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         dones = terminated | truncated
         if dones.any():
             rows = np.flatnonzero(dones)
             lengths, sums = self._lengths[rows], self._sums[:, rows]
             means = (sums[:-1] / lengths).T.tolist()
-            ends = zip(rows.tolist(), truncated[rows].tolist(), sums[-1].tolist(), lengths.tolist(), means, strict=True)
-            for row, kept, total, length, errors in ends:
+            ends = (observations[rows], truncated[rows].tolist(), sums[-1].tolist(), lengths.tolist(), means)
+            position, heading = EPISODE_KEYS
+            for row, last, kept, total, length, errors in zip(rows.tolist(), *ends, strict=True):
                 infos[row] = {
-                    "terminal_observation": observations[row],
+                    "terminal_observation": last,
                     "TimeLimit.truncated": kept,
                     "is_success": kept,
                     "episode": {"r": total, "l": length, "t": 0.0},
-                    **dict(zip(EPISODE_KEYS, errors, strict=True)),
+                    position: errors[0],
+                    heading: errors[1],
                 }
-            self._begin(dones)
-            observations = episodes.observe()
+            self._forget(dones)
+            episodes.start(dones, observations)
         return observations, rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:

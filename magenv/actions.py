@@ -178,7 +178,7 @@ class Actions:
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
         self._home = home_pose(system.n_epm)
-        self._home_epms = home_epms(system.n_epm)
+        self.home_epms = home_epms(system.n_epm)
         self._low, self._high = pose_bounds(system)
         # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))
@@ -193,7 +193,7 @@ class Actions:
 
     def start(self, mask: Bools, measured: Floats, epms: Floats) -> None:
         """Put the EPMs (n, N, 6) at home where ``mask`` says, for robots measured at (n, 2, 3)."""
-        self._workers.run(start_rows, len(mask), mask, measured, self._home_epms, epms)
+        self._workers.run(start_rows, len(mask), mask, measured, self.home_epms, epms)
 
     def to_epms(
         self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None
@@ -212,8 +212,15 @@ class Actions:
             Where a command is wanted; elsewhere the answer is undefined.
         """
         active = np.ones(len(epms), np.bool_) if active is None else active
+        targets, projected = np.empty(epms.shape), np.empty(len(epms), np.bool_)
+        self.command(actions, measured, epms, active, targets, projected)
+        return targets, projected
+
+    def command(
+        self, actions: Floats, measured: Floats, epms: Floats, active: Bools, targets: Floats, projected: Bools
+    ) -> None:
+        """Write what ``to_epms`` returns into ``targets`` (n, N, 6) and ``projected`` (n,), in active rows alone."""
         n, run = len(epms), self._workers.run
-        targets, projected = np.empty(epms.shape), np.empty(n, np.bool_)
         if self.mode == "home":
             run(home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
         elif self.mode == "pose":
@@ -236,7 +243,6 @@ class Actions:
                 targets,
                 projected,
             )
-        return targets, projected
 
 
 def pose_to_action(pose: Floats, system: System) -> NDArray[np.float32]:

@@ -7,7 +7,6 @@ import warnings
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, NonlinearConstraint, minimize
 
 from magenv.poses import POSE_SIZE, from_cartesian, to_cartesian
 from magenv.solver import CONVERGED, ITERATION_LIMIT, STATIONARY, make_interior
@@ -34,6 +33,8 @@ def trust_constr(
     best_wrench: Floats,
 ) -> tuple[float, int, int, int]:
     """Do what ``magenv.solver.best_of`` does with SciPy's trust-region interior-point method, without the images."""
+    from scipy.optimize import Bounds, NonlinearConstraint, minimize  # a quarter of a second that no other needs
+
     r_min, r_max, gap = (float(limit) for limit in limits)
     size = poses.shape[1]
     first, second = np.triu_indices(size // POSE_SIZE, 1)

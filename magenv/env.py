@@ -108,13 +108,13 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.np_random is not self._drawn_from:
             self._drawn_from = self.np_random
             self._episodes.seed(0, self.np_random)
-        self._episodes.start(_ACTIVE)
+        observations = self._episodes.start(_ACTIVE)
         self._running = True
         if self._renderer is not None:
             self._renderer.restart()
         if self.render_mode == "human":
             self.render()
-        return self._episodes.observe()[0], _single(self._episodes.state_info())
+        return observations[0], self._episodes.single_state()
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Command the EPMs for one control period.
@@ -128,17 +128,15 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if not self._running:
             raise RuntimeError("No episode is running; call reset() before step().")
-        reward, terminated, truncated = self._episodes.step(
-            check_action(action, (self._episodes.actions.size,))[None], _ACTIVE
-        )
-        info = self._episodes.single_info()
-        ended = bool(terminated[0] or truncated[0])
-        if ended:
+        episodes = self._episodes
+        observations = episodes.step(check_action(action, (episodes.actions.size,))[None], _ACTIVE)
+        reward, terminated, truncated, info = episodes.single_outcome()
+        if terminated or truncated:
             self._running = False
-            info["is_success"] = bool(truncated[0])
+            info["is_success"] = truncated
         if self.render_mode == "human":
             self.render()
-        return self._episodes.observe()[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        return observations[0], reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: return an RGB array (h, w, 3), or show a window and return None."""
@@ -158,8 +156,3 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-def _single(info: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the first row of every array, numbers as Python's."""
-    return {name: value[0].item() if value.ndim == 1 else value[0].copy() for name, value in info.items()}

@@ -17,16 +17,24 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode, Actions
 from magenv.kernels import kernel
 from magenv.params import PLANTS, InputError, System, TaskParams, choose, require
+from magenv.poses import POSE_SIZE
 from magenv.starts import Starts
-from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode, observe_rows, reward_terms
-from magenv.trajectories import named_trajectory, trajectory_of
+from magenv.steps import begin_episodes, step_kernel, tell_rows
+from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode
+from magenv.trajectories import named_trajectory
 from magenv.workers import Workers
-from magenv.world import World, time_of
+from magenv.world import Measurements, World
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Observations = NDArray[np.float32]
 
-_TERMS = tuple(f"reward_{name}" for name in REWARD_TERMS)
+_STEP_KEYS = (
+    *Measurements.NUMBERS,
+    *Measurements.COUNTS,
+    *(f"reward_{name}" for name in REWARD_TERMS),
+    "projected",
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,7 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
         raise InputError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
     if numbers.shape != shape:
         require(False, "action", f"an array of shape {shape}", numbers.shape)
-    if not _clip(numbers.reshape(-1)):
+    if not _clip(numbers.ravel()):
         numbers = np.array(action, dtype=np.float64)
         require(False, "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
     return numbers
@@ -70,44 +78,6 @@ def _clip(numbers: Floats) -> bool:
         unfit += 0 if abs(numbers[i]) < math.inf else 1
         numbers[i] = min(max(numbers[i], -1.0), 1.0)
     return unfit == 0
-
-
-@kernel
-def _settle_rows(
-    first: int,
-    last: int,
-    active: Bools,
-    robots: Floats,
-    commanded: Bools,
-    numbers: Floats,
-    counts: NDArray[np.int64],
-    step: NDArray[np.int64],
-    duration: Floats,
-    period: float,
-    substeps: int,
-    terms: Floats,
-    measured: Floats,
-    before: Floats,
-    projected: Bools,
-    reward: Floats,
-    terminated: Bools,
-    truncated: Bools,
-) -> None:
-    """Measure the robots after a hold; write what it paid and how it ended. Inactive rows: nothing, not ended."""
-    for i in range(first, last):
-        reward[i], terminated[i], truncated[i] = 0.0, False, False
-        if active[i]:
-            for robot in range(2):
-                for j in range(3):
-                    before[i, robot, j] = measured[i, robot, j]
-                    measured[i, robot, j] = robots[i, robot, j]
-            projected[i] = commanded[i]
-            terms[0, i], terms[1, i] = reward_terms(numbers[0, i], numbers[1, i])
-            reward[i] = 0.5 * (terms[0, i] + terms[1, i])
-            terminated[i] = counts[1, i] > 0
-            time = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
-            over = time >= duration[trajectory_of(i, len(duration))] - 1e-9 * period
-            truncated[i] = over and not terminated[i]
 
 
 class Episodes:
@@ -139,98 +109,132 @@ class Episodes:
         bounds = self.layout.bounds()
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.actions.size,), np.float32)
-        self._bounds = bounds
+        self._shape = (n, self.layout.size)
+        self._every: Bools = np.ones(n, np.bool_)
         self._measured: Floats = np.zeros((n, 2, 3))
         self._before: Floats = np.zeros((n, 2, 3))
-        self._terms: Floats = np.zeros((len(REWARD_TERMS), n))
+        self._targets: Floats = np.zeros(self.world.epms.shape)
         self._projected: Bools = np.zeros(n, np.bool_)
-        self._starts = Starts(n, trajectory is None, self.task, self._workers)
-
-    def seed(self, row: int, rng: np.random.Generator) -> None:
-        """Draw the episodes of ``row`` from ``rng`` from now on."""
-        self._starts.seed(row, rng)
-
-    def start(self, mask: Bools) -> None:
-        """Begin a new episode in each row where ``mask`` says, drawn from the row's generator."""
-        self._starts.place(mask, self.world, self._measured, self._before)
-        self._projected[mask] = False
-        self.actions.start(mask, self._measured, self.world.epms)
-        self.world.begin(mask)
-
-    def observe(self) -> NDArray[np.float32]:
-        """Return the observations (n, d), newly allocated."""
-        w = self.world
-        out = np.empty((len(self._measured), self.layout.size), np.float32)
-        self._workers.run(
-            observe_rows,
-            len(out),
+        self._paid: Floats = np.zeros((len(REWARD_TERMS) + 1, n))  # the terms, then the reward
+        self._ended: Bools = np.zeros((2, n), np.bool_)  # terminated, truncated
+        self._time_s: Floats = np.zeros(n)
+        self._references: Floats = np.zeros((n, 2, 3))
+        self._poses: Floats = np.zeros((n, POSE_SIZE * settings.n_epm))
+        self._starts = Starts(n, trajectory is None, self._workers)
+        w, starts, task = self.world, self._starts, self.task
+        # Arguments of the kernels, collected once: the arrays are the same ones at every step.
+        self._told = (
             self._measured,
             self._before,
             w.coefficients,
             w.duration_s,
             w.step_count,
+            w.measurements.counts,
             w.epms,
             w.period_s,
-            self.system.r_max_m,
-            self.settings.frame == "robots",
-            self._bounds,
-            out,
-        )
-        return out
-
-    def step(self, actions: Floats, active: Bools) -> tuple[Floats, Bools, Bools]:
-        """Act (n, size), checked, for one control period in the active rows; return reward, terminated, truncated."""
-        w, n = self.world, len(active)
-        targets, commanded = self.actions.to_epms(actions, self._measured, w.epms, active)
-        m = w.step(targets, active)
-        reward, terminated, truncated = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)
-        self._workers.run(
-            _settle_rows,
-            n,
-            active,
-            w.robots,
-            commanded,
-            m.numbers,
-            m.counts,
-            w.step_count,
-            w.duration_s,
-            w.period_s,
             w.substeps,
-            self._terms,
+            self.system.r_max_m,
+            settings.frame == "robots",
+            bounds,
+            self._time_s,
+            self._references,
+            self._poses,
+        )
+        self._kernel = step_kernel(settings.n_epm, w.width)
+        self._stepped = (
+            w.robots,
+            w.epms,
+            self._targets,
+            *w.held,
+            self._paid,
+            self._ended,
+            self._every,
             self._measured,
             self._before,
-            self._projected,
-            reward,
-            terminated,
-            truncated,
+            self.system.r_max_m,
+            settings.frame == "robots",
+            bounds,
+            self._time_s,
+            self._references,
+            self._poses,
         )
-        return reward, terminated, truncated
+        self._started = (
+            starts.offsets,
+            starts.used,
+            task.start_position_sd_m,
+            task.start_heading_sd_rad,
+            self.actions.home_epms,
+            task.tracking_distance_m,
+            w.robots,
+            w.measurements.numbers,
+            self._projected,
+            *self._told,
+        )
+
+    def seed(self, row: int, rng: np.random.Generator) -> None:
+        """Draw the episodes of ``row`` from ``rng`` from now on."""
+        self._starts.seed(row, rng)
+
+    def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
+        """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.
+
+        Returns ``observations`` (n, d), without it a new array, with the first ones of these rows written into it.
+        """
+        observations = np.empty(self._shape, np.float32) if observations is None else observations
+        self._starts.draw(mask, self.world.coefficients, self.world.duration_s)
+        self._workers.run(begin_episodes, len(mask), mask, *self._started, observations)
+        return observations
+
+    def observe(self) -> Observations:
+        """Return the observations (n, d), newly allocated."""
+        observations = np.empty(self._shape, np.float32)
+        self._workers.run(tell_rows, len(observations), self._every, *self._told, observations)
+        return observations
+
+    def step(self, actions: Floats, active: Bools) -> Observations:
+        """Act (n, size), checked, for one control period in the active rows.
+
+        Returns the observations (n, d) of all rows, newly allocated; ``outcome`` and ``step_info`` tell the rest.
+        """
+        w = self.world
+        self.actions.command(actions, self._measured, w.epms, active, self._targets, self._projected)
+        observations = np.empty(self._shape, np.float32)
+        self._workers.run(self._kernel, len(active), active, *self._stepped, observations)
+        return observations
+
+    def outcome(self) -> tuple[Floats, Bools, Bools]:
+        """Return reward, terminated and truncated (n,) of the last step, newly allocated."""
+        return self._paid[-1].copy(), self._ended[0].copy(), self._ended[1].copy()
 
     def state_info(self) -> dict[str, NDArray[Any]]:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""
-        time, references, poses = self.world.describe()
-        return {"time_s": time, "robots": self.world.robots.copy(), "reference": references, "epm_pose": poses}
-
-    def single_info(self) -> dict[str, Any]:
-        """Return ``state_info`` and ``step_info`` of a single episode, its numbers as Python's."""
-        m, (time, references, poses) = self.world.measurements, self.world.describe()
-        info: dict[str, Any] = {
-            "time_s": time.item(),
-            "robots": self.world.robots[0].copy(),
-            "reference": references[0],
-            "epm_pose": poses[0],
+        return {
+            "time_s": self._time_s.copy(),
+            "robots": self.world.robots.copy(),
+            "reference": self._references.copy(),
+            "epm_pose": self._poses.copy(),
         }
-        info.update(zip(m.NUMBERS, m.numbers.ravel().tolist(), strict=True))
-        info.update(zip(m.COUNTS, m.counts.ravel().tolist(), strict=True))
-        info.update(zip(_TERMS, self._terms.ravel().tolist(), strict=True))
-        info["projected"] = self._projected.item()
-        return info
 
     def step_info(self) -> dict[str, NDArray[Any]]:
         """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated."""
         m = self.world.measurements
-        info: dict[str, NDArray[Any]] = dict(zip(m.NUMBERS, m.numbers.copy(), strict=True))
-        info |= zip(m.COUNTS, m.counts.copy(), strict=True)
-        info |= zip(_TERMS, self._terms.copy(), strict=True)
-        info["projected"] = self._projected.copy()
-        return info
+        values = (*m.numbers.copy(), *m.counts.copy(), *self._paid[:-1].copy(), self._projected.copy())
+        return dict(zip(_STEP_KEYS, values, strict=True))
+
+    def single_state(self) -> dict[str, Any]:
+        """Return ``state_info`` of a single episode, its numbers as Python's."""
+        return {
+            "time_s": self._time_s.item(),
+            "robots": self.world.robots[0].copy(),
+            "reference": self._references[0].copy(),
+            "epm_pose": self._poses[0].copy(),
+        }
+
+    def single_outcome(self) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Return ``outcome`` of a single episode, and ``single_state`` with ``step_info``, its numbers as Python's."""
+        m, info = self.world.measurements, self.single_state()
+        *terms, reward = self._paid.ravel().tolist()
+        terminated, truncated = self._ended.ravel().tolist()
+        values = m.numbers.ravel().tolist() + m.counts.ravel().tolist() + terms + self._projected.tolist()
+        info.update(zip(_STEP_KEYS, values, strict=True))
+        return reward, terminated, truncated, info

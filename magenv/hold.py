@@ -128,17 +128,112 @@ def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
     return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
 
 
+@kernel
+def hold_rows(
+    first: int,
+    last: int,
+    active: Bools,
+    robots: Floats,
+    epms: Floats,
+    targets: Floats,
+    constants: Floats,
+    mass: Floats,
+    epm_moment: Floats,
+    coefficients: Floats,
+    duration: Floats,
+    step: NDArray[np.int64],
+    numbers: Floats,
+    counts: NDArray[np.int64],
+    period: float,
+    substeps: int,
+    loss_distance: float,
+    tracking_distance: float,
+    diameter: float,
+    wall_radius: float,
+    magnets: tuple[int, ...],
+    side_by_side: tuple[int, ...],
+) -> None:
+    """Hold commands for one control period or until control is lost, several rows at a time.
+
+    A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
+    compute on, unseen. The lengths of the last two tuples, which are types to numba, are the numbers of EPMs and of
+    lanes: constants of the machine code, so that the magnets are unrolled and the lanes vectorised.
+    """
+    n_epm, width = len(magnets), len(side_by_side)
+    lanes, bodies = np.zeros((fields(n_epm), width)), np.empty((2, STATE_SIZE))
+    rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
+    h, upcoming, busy, idle = period / substeps, first, 0, True
+    while True:
+        if idle:  # load rows into the lanes that have none
+            idle = False
+            for i in range(width):
+                while rows[i] < 0 and upcoming < last:
+                    row = upcoming
+                    upcoming += 1
+                    if not active[row]:
+                        continue
+                    rows[i] = row
+                    busy += 1
+                    for j in range(2 * STATE_SIZE):
+                        lanes[X1 + j, i] = robots[row, j // STATE_SIZE, j % STATE_SIZE]
+                    for j in range(CONSTANTS_SIZE):
+                        lanes[CONSTANTS + j, i] = constants[row, j]
+                    # The EPMs jump, as in the paper. Slower ones would travel in the loop over substeps, before
+                    # ``advance``, their state in the lane.
+                    for k in range(n_epm):
+                        for j in range(EPM_SIZE):
+                            epms[row, k, j] = targets[row, k, j]
+                            unit = epm_moment[row] if j >= 3 else 1.0
+                            lanes[EPMS + EPM_SIZE * k + j, i] = unit * targets[row, k, j]
+                    which = trajectory_of(row, len(duration))
+                    lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
+                    lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
+                    position = spline_position(lanes[START, i], lanes[SEGMENT_RATE, i])
+                    _load_segment(lanes, i, position, coefficients[which])
+                    lanes[POSITION_ERROR, i], lanes[HEADING_ERROR, i] = 0.0, 0.0
+                    lanes[SEPARATION_MIN, i] = math.inf
+                    lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row]
+            if busy == 0:
+                return
+        rare = False
+        for i in range(width):
+            advance(lanes, i, n_epm, h)
+            flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
+            rare |= flagged[i]
+        if rare:
+            for i in range(width):
+                if flagged[i]:
+                    _touch(lanes, i, bodies, mass[rows[i]], diameter, wall_radius)
+                    if lanes[PROGRESS, i] > 1.0:
+                        position = lanes[SEGMENT, i] + lanes[PROGRESS, i]
+                        _load_segment(lanes, i, position, coefficients[trajectory_of(rows[i], len(duration))])
+                        lanes[PROGRESS, i] = position - lanes[SEGMENT, i]
+        over = False
+        for i in range(width):
+            flagged[i] = (rows[i] >= 0) & _measure(lanes, i, 1.0 * substeps, loss_distance, tracking_distance)
+            over |= flagged[i]
+        if over:
+            for i in range(width):
+                row = rows[i]
+                if flagged[i]:
+                    for j in range(2 * STATE_SIZE):
+                        robots[row, j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
+                    for j in range(MEASURED_SIZE):
+                        numbers[j, row] = lanes[MEASURED + j, i]
+                    numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
+                    numbers[HEADING_ERROR - MEASURED, row] /= lanes[DONE, i]
+                    counts[0, row], counts[1, row] = int(lanes[DONE, i]), _loss(lanes, i, loss_distance)
+                    step[row] += 1
+                    rows[i], idle = -1, True
+                    busy -= 1
+
+
 @functools.cache
 def hold_kernel(n_epm: int, width: int) -> Callable[..., None]:
-    """Return the kernel that holds commands for one control period or until control is lost, ``width`` rows at a time.
+    """Return ``hold_rows`` for a number of EPMs and of lanes."""
+    magnets, side_by_side = (0,) * n_epm, (0,) * width
 
-    Number of EPMs and width are constants of the machine code: so the magnets are unrolled and the lanes vectorised.
-    A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
-    compute on, unseen.
-    """
-    n_fields = fields(n_epm)
-
-    def hold_rows(
+    def hold(
         first: int,
         last: int,
         active: Bools,
@@ -160,71 +255,29 @@ def hold_kernel(n_epm: int, width: int) -> Callable[..., None]:
         diameter: float,
         wall_radius: float,
     ) -> None:
-        lanes, bodies = np.zeros((n_fields, width)), np.empty((2, STATE_SIZE))
-        rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
-        h, upcoming, busy, idle = period / substeps, first, 0, True
-        while True:
-            if idle:  # load rows into the lanes that have none
-                idle = False
-                for i in range(width):
-                    while rows[i] < 0 and upcoming < last:
-                        row = upcoming
-                        upcoming += 1
-                        if not active[row]:
-                            continue
-                        rows[i] = row
-                        busy += 1
-                        for j in range(2 * STATE_SIZE):
-                            lanes[X1 + j, i] = robots[row, j // STATE_SIZE, j % STATE_SIZE]
-                        for j in range(CONSTANTS_SIZE):
-                            lanes[CONSTANTS + j, i] = constants[row, j]
-                        # The EPMs jump, as in the paper. Slower ones would travel in the loop over substeps, before
-                        # ``advance``, their state in the lane.
-                        for k in range(n_epm):
-                            for j in range(EPM_SIZE):
-                                epms[row, k, j] = targets[row, k, j]
-                                unit = epm_moment[row] if j >= 3 else 1.0
-                                lanes[EPMS + EPM_SIZE * k + j, i] = unit * targets[row, k, j]
-                        which = trajectory_of(row, len(duration))
-                        lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
-                        lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
-                        position = spline_position(lanes[START, i], lanes[SEGMENT_RATE, i])
-                        _load_segment(lanes, i, position, coefficients[which])
-                        lanes[POSITION_ERROR, i], lanes[HEADING_ERROR, i] = 0.0, 0.0
-                        lanes[SEPARATION_MIN, i] = math.inf
-                        lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row]
-                if busy == 0:
-                    return
-            rare = False
-            for i in range(width):
-                advance(lanes, i, n_epm, h)
-                flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
-                rare |= flagged[i]
-            if rare:
-                for i in range(width):
-                    if flagged[i]:
-                        _touch(lanes, i, bodies, mass[rows[i]], diameter, wall_radius)
-                        if lanes[PROGRESS, i] > 1.0:
-                            position = lanes[SEGMENT, i] + lanes[PROGRESS, i]
-                            _load_segment(lanes, i, position, coefficients[trajectory_of(rows[i], len(duration))])
-                            lanes[PROGRESS, i] = position - lanes[SEGMENT, i]
-            over = False
-            for i in range(width):
-                flagged[i] = (rows[i] >= 0) & _measure(lanes, i, 1.0 * substeps, loss_distance, tracking_distance)
-                over |= flagged[i]
-            if over:
-                for i in range(width):
-                    row = rows[i]
-                    if flagged[i]:
-                        for j in range(2 * STATE_SIZE):
-                            robots[row, j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
-                        for j in range(MEASURED_SIZE):
-                            numbers[j, row] = lanes[MEASURED + j, i]
-                        numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
-                        numbers[HEADING_ERROR - MEASURED, row] /= lanes[DONE, i]
-                        counts[0, row], counts[1, row] = int(lanes[DONE, i]), _loss(lanes, i, loss_distance)
-                        step[row] += 1
-                        rows[i], idle = -1, True
-                        busy -= 1
+        hold_rows(
+            first,
+            last,
+            active,
+            robots,
+            epms,
+            targets,
+            constants,
+            mass,
+            epm_moment,
+            coefficients,
+            duration,
+            step,
+            numbers,
+            counts,
+            period,
+            substeps,
+            loss_distance,
+            tracking_distance,
+            diameter,
+            wall_radius,
+            magnets,
+            side_by_side,
+        )
 
-    return kernel(hold_rows)
+    return kernel(hold)

@@ -88,5 +88,7 @@ def start_rows(first: int, last: int, mask: Bools, measured: Floats, home: Float
             s1, c1 = sincos(measured[i, 0, 2])
             s2, c2 = sincos(measured[i, 1, 2])
             frame_c, frame_s = frame_direction(s1, c1, s2, c2)
-            epms[i] = home
+            for k in range(len(home)):
+                for j in range(EPM_SIZE):
+                    epms[i, k, j] = home[k, j]
             _turn(epms[i], frame_c, frame_s)

@@ -6,6 +6,7 @@ vectorises the loops over lanes. Every field is named here and nowhere else.
 
 from __future__ import annotations
 
+from magenv.kernels import law
 from magenv.poses import EPM_SIZE
 
 STATE_SIZE = 6
@@ -37,6 +38,7 @@ EPMS = 58
 """First field of the EPMs: centre (m) and moment (A m^2) of each."""
 
 
+@law
 def fields(n_epm: int) -> int:
     """Return the number of fields."""
     return EPMS + EPM_SIZE * n_epm

@@ -68,7 +68,7 @@ class Scene:
 def scene_of(world: World, row: int) -> Scene:
     """Return a copy of what there is to see of one episode; where control is lost, at that very instant."""
     trajectory = world.trajectory(row)
-    time = float(world.time_s()[row])
+    time = world.time_s(row)
     samples = np.linspace(0.0, trajectory.duration_s, PATH_SAMPLES)
     return Scene(
         time_s=time,

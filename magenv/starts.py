@@ -7,10 +7,8 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel
-from magenv.params import TaskParams
 from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_kernel, trajectory_of
 from magenv.workers import Workers
-from magenv.world import World
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -20,7 +18,7 @@ _AHEAD = 32
 
 
 @kernel
-def _place_rows(
+def place_rows(
     first: int,
     last: int,
     mask: Bools,
@@ -56,19 +54,20 @@ class Starts:
     They are drawn many at a time, since a call of a generator costs as much as its numbers.
     """
 
-    def __init__(self, n: int, random: bool, task: TaskParams, workers: Workers) -> None:
+    def __init__(self, n: int, random: bool, workers: Workers) -> None:
         self._random = random
-        self._task = task
         self._workers = workers
         self._rngs: list[np.random.Generator | None] = [None] * n
-        self._used: NDArray[np.int64] = np.full(n, _AHEAD)
-        self._offsets: Floats = np.zeros((n, _AHEAD, 6))
+        self.used: NDArray[np.int64] = np.full(n, _AHEAD)
+        self.offsets: Floats = np.zeros((n, _AHEAD, 6))
+        self._sure = 0  # so many starts are drawn in every row
         self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if random else 0), np.uint64)
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Draw the episodes of ``row`` from ``rng`` from now on."""
         self._rngs[row] = rng
-        self._used[row] = _AHEAD
+        self.used[row] = _AHEAD
+        self._sure = 0
 
     def _draw_ahead(self, row: int) -> None:
         rng = self._rngs[row]
@@ -76,30 +75,20 @@ class Starts:
             rng = self._rngs[row] = seeding.np_random(None)[0]
         if self._random:
             self._keys[row] = draw_keys(rng, _AHEAD)
-        rng.standard_normal(out=self._offsets[row])
-        self._used[row] = 0
+        rng.standard_normal(out=self.offsets[row])
+        self.used[row] = 0
 
-    def place(self, mask: Bools, world: World, measured: Floats, before: Floats) -> None:
-        """Put the robots at the start of their next episodes where ``mask`` says, at rest.
+    def draw(self, mask: Bools, coefficients: Floats, duration: Floats) -> None:
+        """Draw the next episodes of the rows where ``mask`` says; random trajectories are written to the arrays.
 
-        Their poses also go to ``measured`` and ``before`` (n, 2, 3).
+        What is left is ``place_rows``, with ``offsets`` and ``used``.
         """
-        for row in np.flatnonzero(mask & (self._used == _AHEAD)).tolist():
-            self._draw_ahead(row)
+        if self._sure == 0:
+            for row in np.flatnonzero(mask & (self.used == _AHEAD)).tolist():
+                self._draw_ahead(row)
+            self._sure = _AHEAD - int(self.used.max())
+        self._sure = max(self._sure - 1, 0)
         if self._random:
-            keys = self._keys[np.arange(len(mask)), np.minimum(self._used, _AHEAD - 1)]
-            self._workers.run(draw_rows, len(mask), mask, keys, *random_limits(), world.coefficients, world.duration_s)
-        self._workers.run(
-            _place_rows,
-            len(mask),
-            mask,
-            self._offsets,
-            self._used,
-            self._task.start_position_sd_m,
-            self._task.start_heading_sd_rad,
-            world.coefficients,
-            world.duration_s,
-            world.robots,
-            measured,
-            before,
-        )
+            self._workers.run(
+                draw_rows, len(mask), mask, self._keys, self.used, *random_limits(), coefficients, duration
+            )

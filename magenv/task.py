@@ -33,6 +33,7 @@ from magenv.poses import frame_direction
 from magenv.trajectories import reference_kernel, trajectory_of
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Frame = Literal["robots", "global"]
 ObservationMode = Literal["full", "errors"]
 
@@ -164,6 +165,7 @@ def _observe(
 def observe_rows(
     first: int,
     last: int,
+    mask: Bools,
     measured: Floats,
     before: Floats,
     coefficients: Floats,
@@ -176,23 +178,30 @@ def observe_rows(
     bounds: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write the observations (n, d) of rows ``first`` to ``last``; the arguments are those of ``World``."""
-    references = np.empty((_BLOCK, PREVIEW, 2, 3))
-    angles, sines, cosines = np.empty(4 * _BLOCK), np.empty(4 * _BLOCK), np.empty(4 * _BLOCK)
+    """Write the observations (n, d) of rows ``first`` to ``last`` where ``mask`` says; see ``World`` for the rest."""
+    block = min(_BLOCK, last - first)
+    references = np.empty((block, PREVIEW, 2, 3))
+    angles, sines, cosines = np.empty(4 * block), np.empty(4 * block), np.empty(4 * block)
     full = np.empty(_EPMS + _EPM_SIZE * epms.shape[1])
     for start in range(first, last, _BLOCK):
-        end = min(start + _BLOCK, last)
+        end, count = min(start + _BLOCK, last), 0
         for i in range(start, end):
-            which, reference = trajectory_of(i, len(duration)), references[i - start]
-            for k in range(PREVIEW):
-                reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, reference[k])
-            for robot in range(2):
-                angles[4 * (i - start) + robot] = measured[i, robot, 2]
-                angles[4 * (i - start) + 2 + robot] = reference[0, robot, 2] - measured[i, robot, 2]
-        sincos_all(angles, 4 * (end - start), sines, cosines)
+            if mask[i]:
+                which, reference = trajectory_of(i, len(duration)), references[count]
+                for k in range(PREVIEW):
+                    reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, reference[k])
+                for robot in range(2):
+                    angles[4 * count + robot] = measured[i, robot, 2]
+                    angles[4 * count + 2 + robot] = reference[0, robot, 2] - measured[i, robot, 2]
+                count += 1
+        sincos_all(angles, 4 * count, sines, cosines)
+        count = 0
         for i in range(start, end):
-            at = slice(4 * (i - start), 4 * (i - start) + 4)
-            reference, s, c = references[i - start], sines[at], cosines[at]
+            if not mask[i]:
+                continue
+            at = slice(4 * count, 4 * count + 4)
+            reference, s, c = references[count], sines[at], cosines[at]
+            count += 1
             _observe(measured[i], before[i], reference, epms[i], period, r_max, carried, s, c, full)
             for j in range(out.shape[1]):
                 value = np.float32(full[j]) if abs(full[j]) < math.inf else np.float32(0.0)

@@ -238,16 +238,20 @@ def draw_rows(
     last: int,
     mask: Bools,
     keys: Keys,
+    used: NDArray[np.int64],
     duration_s: float,
     turn_max: float,
     coefficients: Floats,
     duration: Floats,
 ) -> None:
-    """Draw trajectories (n, 2, 32, 3, 4) and (n,) from the keys (n,) where ``mask`` says, of rows first to last."""
+    """Draw trajectories (n, 2, 32, 3, 4) and (n,) where ``mask`` says, of rows first to last.
+
+    Each from the first of its row's keys (n, k) after the ``used`` ones (n,).
+    """
     knots, slopes, stream = np.empty((SEGMENTS + 1, 2, 3)), np.empty((SEGMENTS + 1, 2, 3)), np.empty(1, np.uint64)
     for i in range(first, last):
         if mask[i]:
-            stream[0] = keys[i]
+            stream[0] = keys[i, used[i]]
             while not _try_knots(stream, duration_s, turn_max, knots):
                 pass
             spline_through(knots, slopes, coefficients[i])
@@ -276,5 +280,6 @@ def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
     if named is not None:
         return named
     coefficients, duration = np.empty((1, 2, SEGMENTS, 3, 4)), np.empty(1)
-    draw_rows(0, 1, np.ones(1, np.bool_), draw_keys(rng, 1), *random_limits(), coefficients, duration)
+    keys, used = draw_keys(rng, 1)[None], np.zeros(1, np.int64)
+    draw_rows(0, 1, np.ones(1, np.bool_), keys, used, *random_limits(), coefficients, duration)
     return Trajectory(float(duration[0]), coefficients[0])

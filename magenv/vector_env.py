@@ -12,13 +12,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
-from magenv.episodes import Bools, Episodes, Settings, check_action
+from magenv.episodes import Bools, Episodes, Observations, Settings, check_action
 from magenv.params import is_whole, require
 from magenv.render import RENDER_FPS, Renderer
 from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
 
-Observations = NDArray[np.float32]
 Rewards = NDArray[np.float64]
 
 
@@ -97,8 +96,9 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
             own = seeds[row]
             if own is not None:
                 self._episodes.seed(row, seeding.np_random(int(own))[0])
-        self._start(mask)
-        return self._episodes.observe(), _masked(self._episodes.state_info(), mask)
+        observations = self._episodes.observe()
+        self._start(mask, observations)
+        return observations, _masked(self._episodes.state_info(), mask)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Rewards, Bools, Bools, dict[str, Any]]:
         """Command the EPMs of all episodes for one control period.
@@ -119,36 +119,36 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         checked = check_action(actions, (self.num_envs, self._episodes.actions.size))
         resetting = self._ended.copy()
         active = ~resetting
-        reward, terminated, truncated = self._episodes.step(checked, active)
+        observations = self._episodes.step(checked, active)
+        reward, terminated, truncated = self._episodes.outcome()
         ended = terminated | truncated
         if resetting.any():
-            self._start(resetting)
+            self._start(resetting, observations)
         info = _masked(self._episodes.step_info(), active)
         info |= _masked({"is_success": truncated.copy()}, ended)
         self._ended = ended.copy()
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
-            info = self._same_step(info, ended)
+            info = self._same_step(info, ended, observations)
         info |= _masked(self._episodes.state_info(), np.ones(self.num_envs, np.bool_))
-        return self._episodes.observe(), reward, terminated, truncated, info
+        return observations, reward, terminated, truncated, info
 
-    def _same_step(self, info: dict[str, Any], ended: Bools) -> dict[str, Any]:
+    def _same_step(self, info: dict[str, Any], ended: Bools, observations: Observations) -> dict[str, Any]:
         """Begin the ended episodes anew; return the info of the others, with the end of these beside it."""
         final_obs = np.full(self.num_envs, None, dtype=object)
-        observations = self._episodes.observe()
-        for row in np.flatnonzero(ended):
-            final_obs[row] = observations[row].copy()
+        for row, last in zip(np.flatnonzero(ended).tolist(), observations[ended], strict=True):
+            final_obs[row] = last
         values = {name: value for name, value in info.items() if not name.startswith("_")}
         final = _masked({name: value.copy() for name, value in values.items()} | self._episodes.state_info(), ended)
         values.pop("is_success")
-        self._start(ended)
+        self._start(ended, observations)
         return (
             _masked(values, ~ended)
             | _masked({"final_obs": final_obs}, ended)
             | {"final_info": final, "_final_info": ended.copy()}
         )
 
-    def _start(self, mask: Bools) -> None:
-        self._episodes.start(mask)
+    def _start(self, mask: Bools, observations: Observations) -> None:
+        self._episodes.start(mask, observations)
         if self._renderers:
             for row in np.flatnonzero(mask):
                 self._renderers[row].restart()

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ _FEW = 4
 
 
 class Measurements:
-    """What a world measures of one hold, from the true state; arrays of length ``n``, views of two tables.
+    """What a world measures of one hold, from the true state; arrays of length ``n``, rows of two tables.
 
     Errors are means over both robots; without a suffix also over the substeps of the hold.
 
@@ -61,20 +62,20 @@ class Measurements:
     def __init__(self, n: int) -> None:
         self.numbers: Floats = np.zeros((len(self.NUMBERS), n))
         self.counts: NDArray[np.int64] = np.zeros((len(self.COUNTS), n), np.int64)
-        (
-            self.position_error_m,
-            self.heading_error_rad,
-            self.position_error_end_m,
-            self.heading_error_end_rad,
-            self.separation_min_m,
-            self.separation_tracked_m,
-        ) = self.numbers
-        self.substeps, self.loss = self.counts
         self.numbers[4:] = np.nan
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        if name in self.NUMBERS + self.COUNTS:  # not kept: copies of this object would hold copies of the rows
+            numbers = name in self.NUMBERS
+            row: NDArray[Any] = (
+                self.numbers[self.NUMBERS.index(name)] if numbers else self.counts[self.COUNTS.index(name)]
+            )
+            return row
+        raise AttributeError(name)
 
 
 @kernel
-def _begin_rows(
+def begin_rows(
     first: int,
     last: int,
     mask: Bools,
@@ -86,6 +87,7 @@ def _begin_rows(
     numbers: Floats,
     counts: Integers,
 ) -> None:
+    """Begin episodes where ``mask`` says, with the states and trajectories that the rows hold."""
     reference = np.empty((2, 3))
     for i in range(first, last):
         if mask[i]:
@@ -107,9 +109,10 @@ def time_of(step: int, substeps_done: int, loss: int, period: float, substeps: i
 
 
 @kernel
-def _describe_rows(
+def describe_rows(
     first: int,
     last: int,
+    mask: Bools,
     coefficients: Floats,
     duration: Floats,
     step: Integers,
@@ -121,12 +124,19 @@ def _describe_rows(
     references: Floats,
     poses: Floats,
 ) -> None:
-    for i in range(first, last):
-        which = trajectory_of(i, len(duration))
-        time[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
-        reference_kernel(coefficients[which], duration[which], time[i], references[i])
-    n_epm = epms.shape[1]
-    epms_to_poses(epms.reshape(-1, EPM_SIZE), first * n_epm, last * n_epm, poses.reshape(-1, POSE_SIZE))
+    """Write times (n,), references (n, 2, 3) at these times and the EPMs' pose vectors (n, 5 N) where ``mask`` says."""
+    n_epm, i = epms.shape[1], first
+    while i < last:
+        start = i
+        while i < last and mask[i]:
+            which = trajectory_of(i, len(duration))
+            time[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
+            reference_kernel(coefficients[which], duration[which], time[i], references[i])
+            i += 1
+        if i > start:  # neighbours together, so that their angles are vectorised
+            epms_to_poses(epms.reshape(-1, EPM_SIZE), start * n_epm, i * n_epm, poses.reshape(-1, POSE_SIZE))
+        else:
+            i += 1
 
 
 class World:
@@ -153,6 +163,10 @@ class World:
         Control periods since the start.
     coefficients, duration_s : ndarray, shape (n or 1, 2, 32, 3, 4) and (n or 1,)
         The trajectories; one where all rows follow the same.
+    width : int
+        Lanes of the hold.
+    held : tuple
+        The last arguments of the hold, the same at every step.
     """
 
     def __init__(
@@ -168,12 +182,10 @@ class World:
         self.period_s = task.period_s
         # As many equal substeps as fit, none longer than the plant's.
         self.substeps = max(1, math.ceil(task.period_s / plant.substep_s - 1e-9))
-        self._loss_distance = task.loss_distance_m
         self._tracking_distance = task.tracking_distance_m
         self._workers = workers or Workers()
-        self._hold = hold_kernel(system.n_epm, 1 if n <= _FEW else _WIDTH)
-        self._constants: Floats = np.empty((n, CONSTANTS_SIZE))
-        constants(self.physics, task.period_s / self.substeps, self._constants)
+        self.width = 1 if n <= _FEW else _WIDTH
+        self._hold = hold_kernel(system.n_epm, self.width)
         self.robots: Floats = np.zeros((n, 2, 6))
         self.epms: Floats = np.zeros((n, system.n_epm, 6))
         own = n if trajectory is None else 1
@@ -183,6 +195,25 @@ class World:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
         self.step_count: Integers = np.zeros(n, np.int64)
         self.measurements = Measurements(n)
+        per_substep: Floats = np.empty((n, CONSTANTS_SIZE))
+        constants(self.physics, task.period_s / self.substeps, per_substep)
+        # Collected once: the arrays are the same ones at every step, and looking them up costs as much as a short hold.
+        self.held = (
+            per_substep,
+            self.physics.mass,
+            self.physics.epm_moment,
+            self.coefficients,
+            self.duration_s,
+            self.step_count,
+            self.measurements.numbers,
+            self.measurements.counts,
+            self.period_s,
+            self.substeps,
+            task.loss_distance_m,
+            task.tracking_distance_m,
+            self.physics.body_diameter,
+            self.physics.wall_radius,
+        )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:
         """Begin an episode in ``row``, which has a trajectory of its own, with given states (2, 6) and EPMs (N, 6)."""
@@ -196,7 +227,7 @@ class World:
         """Begin episodes where ``mask`` says, with the states, EPMs and trajectories that the rows hold."""
         m = self.measurements
         self._workers.run(
-            _begin_rows,
+            begin_rows,
             len(mask),
             mask,
             self.robots,
@@ -219,51 +250,10 @@ class World:
         Where control is lost, the row stops at that substep. Returns the world's own ``measurements``, overwritten at
         the next step.
         """
-        m, physics = self.measurements, self.physics
-        self._workers.run(
-            self._hold,
-            len(self.robots),
-            active,
-            self.robots,
-            self.epms,
-            targets,
-            self._constants,
-            physics.mass,
-            physics.epm_moment,
-            self.coefficients,
-            self.duration_s,
-            self.step_count,
-            m.numbers,
-            m.counts,
-            self.period_s,
-            self.substeps,
-            self._loss_distance,
-            self._tracking_distance,
-            physics.body_diameter,
-            physics.wall_radius,
-        )
-        return m
+        self._workers.run(self._hold, len(self.robots), active, self.robots, self.epms, targets, *self.held)
+        return self.measurements
 
-    def time_s(self) -> Floats:
-        """Return the time (n,) in s: the control instant, or the substep at which control was lost."""
-        return self.describe()[0]
-
-    def describe(self) -> tuple[Floats, Floats, Floats]:
-        """Return times (n,), references (n, 2, 3) at these times and the EPMs' pose vectors (n, 5 N)."""
-        n, n_epm = self.epms.shape[:2]
-        time, references, poses = np.empty(n), np.empty((n, 2, 3)), np.empty((n, POSE_SIZE * n_epm))
-        self._workers.run(
-            _describe_rows,
-            n,
-            self.coefficients,
-            self.duration_s,
-            self.step_count,
-            self.measurements.counts,
-            self.period_s,
-            self.substeps,
-            self.epms,
-            time,
-            references,
-            poses,
-        )
-        return time, references, poses
+    def time_s(self, row: int) -> float:
+        """Return the time of a row in s: the control instant, or the substep at which control was lost."""
+        done, loss = self.measurements.counts[:, row].tolist()
+        return time_of(int(self.step_count[row]), done, loss, self.period_s, self.substeps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import pickle
 from collections.abc import Callable, Iterator
@@ -17,9 +18,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import magenv
+from magenv import episodes
 from magenv.actions import ActionMode
 from magenv.env import TwoRobots
-from magenv.params import PLANTS
+from magenv.params import PLANTS, TaskParams
 from magenv.task import Frame, ObservationMode
 from magenv.trajectories import Trajectory, draw
 from magenv.world import LOSSES
@@ -103,6 +105,24 @@ def test_a_copy_of_a_drawn_env_goes_on_as_the_original(make_env: MakeEnv, copied
     assert before is not None
     assert other.render().shape == before.shape
     other.close()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_shares_nothing_and_goes_on_alike(make_env: MakeEnv, copied: Callable[[Any], Any]) -> None:
+    """Through ends and new beginnings: what the kernels are given is the copy's own state, all of it."""
+    env = make_env(control_hz=20.0)
+    env.reset(seed=3)
+    env.step(still(env))
+    other = copied(env)
+    ended = 0
+    for result in rollout(env, None, 5):
+        ended += result[2]
+    assert ended > 0
+    rest = rollout(other, None, 5)
+    for one, two in zip(rollout(copied(other), None, 5), rest, strict=True):
+        for x, y in zip(one, two, strict=True):
+            assert_same_bits(x, y)
+    np.testing.assert_array_equal(other._episodes.world.measurements.loss, other._episodes.world.measurements.counts[1])
 
 
 def test_spec_goes_through_json_and_pickle() -> None:
@@ -289,11 +309,13 @@ def test_end_of_the_reference_truncates(make_env: MakeEnv, stuck_plant: str, con
         env.step(still(env))
 
 
-def test_reference_that_ends_within_a_hold_truncates_at_its_end(make_env: MakeEnv, stuck_plant: str) -> None:
+def test_reference_that_ends_within_a_hold_truncates_at_its_end(
+    make_env: MakeEnv, stuck_plant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At 0.035 Hz the fourth hold passes the end of the reference."""
+    monkeypatch.setattr(episodes, "TaskParams", functools.partial(TaskParams, loss_distance_m=1.0))
     env = make_env(scenario="approach-100", plant=stuck_plant, control_hz=0.035)
     env.reset(seed=0)
-    env._episodes.world._loss_distance = 1.0
     flags = [env.step(still(env))[2:4] for _ in range(3)]
     assert flags == [(False, False)] * 3
     assert env.step(still(env))[2:4] == (False, True)

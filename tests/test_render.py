@@ -216,7 +216,8 @@ def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
     kept = 0
     scene = scene_of(world, 0)
     while not scene.loss:
-        terminated = episodes.step(FAR[None], active)[1]
+        episodes.step(FAR[None], active)
+        terminated = episodes.outcome()[1]
         scene = scene_of(world, 0)
         assert scene.position_error_m == pytest.approx(world.measurements.position_error_end_m[0], rel=1e-9)
         assert scene.heading_error_rad == pytest.approx(world.measurements.heading_error_end_rad[0], rel=1e-9)

@@ -28,7 +28,6 @@ ORDER = [
     "interior",
     "solver",
     "allocation_scipy",
-    "workers",
     "allocation_input",
     "allocation",
     "crosstalk",
@@ -41,6 +40,7 @@ ORDER = [
     "actions",
     "task",
     "starts",
+    "steps",
     "episodes",
     "scene",
     "canvas",
@@ -69,6 +69,7 @@ def imports(path: Path) -> set[str]:
 
 def test_every_module_has_a_room() -> None:
     assert set(MODULES) <= set(ORDER)
+    assert len(set(ORDER)) == len(ORDER)
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magenv.env import TwoRobots
-from magenv.hold import hold_kernel
+from magenv.hold import hold_rows
 from magenv.params import System, TaskParams
 from magenv.trajectories import approach
 from magenv.vector_env import TwoRobotsVector
@@ -136,9 +136,9 @@ def test_nan_in_a_lane_never_touches_its_neighbours() -> None:
 @pytest.fixture(scope="module")
 def compiled() -> Any:
     """The hold of two EPMs in sixteen lanes, compiled here: numba does not show cached code."""
-    cached: Any = hold_kernel(2, 16)
-    world = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams())
-    world.step(world.epms, np.zeros(16, np.bool_))
+    cached: Any = hold_rows
+    world, idle = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams()), np.zeros(16, np.bool_)
+    hold_rows(0, 16, idle, world.robots, world.epms, world.epms, *world.held, (0,) * 2, (0,) * 16)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
     fresh.compile(cached.signatures[0])
     return fresh

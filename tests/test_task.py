@@ -170,9 +170,10 @@ def test_a_turned_episode_stays_turned_in_home_mode(angle: float) -> None:
     rng, active = np.random.default_rng(0), np.ones(6, np.bool_)
     for _ in range(3):
         actions = rng.uniform(-0.3, 0.3, (6, 10))
-        (reward, terminated, _), (turned_reward, turned_terminated, _) = (
-            batch.step(actions, active) for batch in (straight, turned)
-        )
+        for batch in (straight, turned):
+            batch.step(actions, active)
+        reward, terminated, _ = straight.outcome()
+        turned_reward, turned_terminated, _ = turned.outcome()
         np.testing.assert_allclose(turned_reward[active], reward[active], atol=1e-6)
         np.testing.assert_array_equal(turned_terminated, terminated)
         active &= ~terminated
