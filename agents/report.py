@@ -187,7 +187,11 @@ def _estimate(value: float | None, interval: Interval | None) -> tuple[str, str]
     """Return three significant digits and the interval; a dash where there is nothing."""
     if value is None or interval is None:
         return "-", ""
-    return f"{value:.3g}", f"{interval[0]:.3g}\N{EN DASH}{interval[1]:.3g}"
+    return _three_digits(value), f"{_three_digits(interval[0])}\N{EN DASH}{_three_digits(interval[1])}"
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:#.3g}".rstrip(".")
 
 
 def _median(value: float | None) -> tuple[str, str]:

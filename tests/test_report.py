@@ -113,7 +113,7 @@ def test_the_table_is_whole_in_80_columns(records: list[Record]) -> None:
     assert "[bold]a" in text.getvalue()
     assert "51 s" in text.getvalue()
     (ppo,) = (line.split() for line in lines if line.strip().startswith("ppo"))
-    assert ppo[1:5] == ["100", "%", "1", "0.229"]
+    assert ppo[1:5] == ["100", "%", "1.00", "0.229"]
     (lost,) = (line.split() for line in lines if line.strip().startswith("baseline"))
     assert lost[1:5] == ["0", "%", "-", "-"]
     assert "15.0" in lost
