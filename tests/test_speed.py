@@ -138,10 +138,8 @@ def compiled() -> Any:
     """The hold of two EPMs in sixteen lanes, compiled here: numba does not show cached code."""
     cached: Any = hold_rows
     world, idle = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams()), np.zeros(16, np.bool_)
-    hold_rows(0, 16, idle, world.robots, world.epms, world.epms, *world.held, (0,) * 2, (0,) * 16)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
-    (signature,) = (each for each in cached.signatures if (each[-2].count, each[-1].count) == (2, 16))
-    fresh.compile(signature)
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, (0,) * 2, (0,) * 16)
     return fresh
 
 
