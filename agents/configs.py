@@ -135,8 +135,8 @@ class TrainConfig:
     run), or that of --resume."""
     resume: Path | None = None
     """Folder of a run to go on with, as it was configured; --steps, --out and --checkpoint-every may change."""
-    checkpoint_every: int = 250_000
-    """Steps between checkpoints."""
+    checkpoint_every: int | None = None
+    """Steps between checkpoints; by default a tenth of all, at most 250,000."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 
@@ -145,7 +145,8 @@ class TrainConfig:
         if self.steps is not None:
             _whole(1, math.inf, steps=self.steps)
         _whole(0, 2**32 - 1, seed=self.seed)
-        _whole(1, math.inf, checkpoint_every=self.checkpoint_every)
+        if self.checkpoint_every is not None:
+            _whole(1, math.inf, checkpoint_every=self.checkpoint_every)
 
     @property
     def folder(self) -> Path:
@@ -160,6 +161,11 @@ class TrainConfig:
         return Settings(
             self.scenario, self.plant, self.n_epm, self.action, self.observation, self.frame, self.control_hz
         )
+
+    @property
+    def checkpoint_steps(self) -> int:
+        """Environment steps between checkpoints."""
+        return self.checkpoint_every or max(1, min(250_000, self.total_steps // 10))
 
     @property
     def total_steps(self) -> int:

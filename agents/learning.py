@@ -13,23 +13,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.checkpoints import check_goes_on, restore, save_model
+from agents.checkpoints import check_goes_on, checkpoints, restore, save_model
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import CLIP_OBSERVATION, policy_kwargs
 from agents.progress import Reporter, logger
 from agents.records import check_output_dir
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import check_replaceable
-from magenv.params import require
+from magenv.params import InputError
 
 DEFAULT_FOLDER = Path("runs/train")
-_MARK = "run"
-"""Empty file that makes a folder a run's, from before the first checkpoint on."""
 
 
 def _falling(start: float) -> Any:
@@ -94,19 +93,30 @@ class _Refill(BaseCallback):
         return True
 
 
-def _claim(folder: Path) -> bool:
-    """Make the folder that of a new run; return False where it is another run's, begun even at this very moment."""
+def _lock(folder: Path) -> FileLock | None:
+    """Return the lock of a run's folder, held from now on; None where another training holds it.
+
+    The system frees it when the process ends, however it does.
+    """
     check_output_dir(folder)
-    if any((folder / name).exists() for name in ("checkpoints", "model")):
-        return False
+    lock = FileLock(folder / ".lock")
     try:
-        (folder / _MARK).touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True
+        lock.acquire(timeout=0)
+    except Timeout:
+        return None
+    return lock
 
 
-def _new_run(config: TrainConfig) -> TrainConfig:
+def _claim(folder: Path) -> FileLock | None:
+    """Return the lock of a new run's folder; None where it is another run's, begun even at this very moment."""
+    lock = _lock(folder)
+    if lock is not None and (checkpoints(folder) or (folder / "model").exists()):
+        lock.release()
+        return None
+    return lock
+
+
+def _new_run(config: TrainConfig) -> tuple[TrainConfig, FileLock]:
     """Return the configuration with the folder of a new run: ``out``, or the first of the default's names still free.
 
     Raises
@@ -114,12 +124,14 @@ def _new_run(config: TrainConfig) -> TrainConfig:
     InputError
         If ``out`` holds a run or cannot be written.
     """
-    if config.out is not None:
-        free = _claim(config.out)
-        require(free, "out", "a folder without a run (to go on with one: resume)", str(config.out))
-        return config
     names = (DEFAULT_FOLDER.with_name(f"{DEFAULT_FOLDER.name}-{k}") for k in itertools.count(2))
-    return dataclasses.replace(config, out=next(filter(_claim, itertools.chain([DEFAULT_FOLDER], names))))
+    for folder in itertools.chain([DEFAULT_FOLDER], names) if config.out is None else [config.out]:
+        lock = _claim(folder)
+        if lock is not None:
+            return dataclasses.replace(config, out=folder), lock
+    raise InputError(
+        f"Input out must be a folder without a run (to go on with one: resume); instead received {str(config.out)!r}."
+    )
 
 
 def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
@@ -137,40 +149,50 @@ def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
     Raises
     ------
     InputError
-        If the configuration, or the run to go on with, is unsound, or ``out`` holds a run.
+        If the configuration, or the run to go on with, is unsound, ``out`` holds a run, or the run is in training.
     KeyboardInterrupt
         If Ctrl-C came before the first step.
     """
     torch.set_num_threads(1)  # two threads on two cores spin: ten times slower
-    start = check_goes_on(config) if config.resume is not None else None
+    new = config.resume is None or config.folder.resolve() != config.resume.resolve()
+    if config.resume is not None:
+        check_goes_on(config)
     model, env = build(config)
-    if start is not None:
-        restore(start, model, env, config.algo)
+    if new:
+        config, lock = _new_run(config)
+    else:
+        held = _lock(config.folder)
+        if held is None:
+            raise InputError(f"Input resume must be a run at rest; instead received {config.resume}, in training now.")
+        lock = held
+    try:
+        return config.folder, _learn(config, model, env, command)
+    finally:
+        env.close()
+        lock.release()
+
+
+def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command: str) -> bool:
+    """Train in the run's folder, which is ours alone; return whether the training ran to its end."""
+    callbacks: list[BaseCallback] = [progress := Reporter(model, config, env, command)]
+    if config.resume is not None:
+        restore(check_goes_on(config), model, env, config.algo)
         # Not the first run's episodes again.
         env.seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
-    new = config.resume is None or config.folder.resolve() != config.resume.resolve()
-    if new:
-        config = _new_run(config)
-    folder = config.folder
-    check_output_dir(folder)
-    check_replaceable(folder / "model")
+        if isinstance(model, SAC):
+            callbacks.append(_Refill(config.sac))
+    check_replaceable(config.folder / "model")
     begun, finished = model.num_timesteps, True
     model.set_logger(logger(config, begun))
-    callbacks: list[BaseCallback] = [progress := Reporter(model, config, env, command)]
-    if start is not None and isinstance(model, SAC):
-        callbacks.append(_Refill(config.sac))
     try:
         interval = 1 if config.algo == "ppo" else 50
         model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
     except KeyboardInterrupt:
         finished = False
         if model.num_timesteps == begun:
-            if new:
-                (folder / _MARK).unlink()  # nothing to go on with: the folder is free again
             raise
     finally:
         progress.close()
-        env.close()
     progress.checkpoint()
-    save_model(folder / "model", model, env, config, False, command)
-    return folder, finished
+    save_model(config.folder / "model", model, env, config, False, command)
+    return finished

@@ -46,7 +46,7 @@ class Reporter(BaseCallback):
         )
 
     def _on_training_start(self) -> None:
-        every = self._config.checkpoint_every
+        every = self._config.checkpoint_steps
         self._next_checkpoint = (self.num_timesteps // every + 1) * every
         self._bar.start()
         self._task = self._bar.add_task(self._config.algo, total=self._config.total_steps, told="")
@@ -55,7 +55,7 @@ class Reporter(BaseCallback):
         self._episodes.extend(info for info in self.locals["infos"] if "is_success" in info)
         self._bar.update(self._task, completed=self.num_timesteps, told=self._record())
         if self.num_timesteps >= self._next_checkpoint:
-            self._next_checkpoint += self._config.checkpoint_every
+            self._next_checkpoint += self._config.checkpoint_steps
             self.checkpoint()
         return True
 

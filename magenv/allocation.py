@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.allocation_input import checked_problem, draw_starts
+from magenv.allocation_input import check_limits, checked_problem, draw_starts
 from magenv.allocation_scipy import trust_constr
 from magenv.kernels import kernel
 from magenv.params import System, common_shape, require
@@ -211,6 +211,7 @@ def allocate(
     """
     require(method in ("interior-point", "trust-constr"), "method", "interior-point or trust-constr", method)
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=False)
+    check_limits(tolerance, max_iterations)
     scale = _weights(force_scale_n, torque_scale_nm)
     poses = draw_starts(system, starts, seed, first is not None)
     poses = poses.copy() if first is None else np.concatenate([first[None], poses])
@@ -277,6 +278,7 @@ def allocate_batch(
         If a shape does not fit or a value is not finite.
     """
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=True)
+    check_limits(tolerance, max_iterations)
     scale = _weights(force_scale_n, torque_scale_nm)
     drawn = draw_starts(system, starts, seed, first is not None)
     warm = np.empty(0) if first is None else first

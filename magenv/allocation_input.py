@@ -15,6 +15,8 @@ from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
 
+_LEAST_M = 1e-6
+"""Nearer robots cannot be: their mutual wrench grows beyond all numbers."""
 _MOST = 1e9
 """Size of any number taken in, SI units: far beyond all magnets, far from what overflows."""
 
@@ -76,12 +78,19 @@ def checked_problem(
     u_d = _finite("target", target, (WRENCH_SIZE,), leading)
     p, m = _finite("positions", positions, (2, 3), leading), _finite("moments", moments, (2, 3), leading)
     pairs, rows = p.reshape(-1, 2, 3), m.reshape(-1, 3)
-    if not _least_size(pairs[:, 0], pairs[:, 1]) > 0.0:
-        require(False, "positions", "of two robots apart from each other", p.tolist())
+    if not _least_size(pairs[:, 0], pairs[:, 1]) > _LEAST_M**2:
+        require(False, "positions", f"of two robots over {_LEAST_M:g} m apart from each other", p.tolist())
     if not _least_size(rows, np.zeros_like(rows)) > 0.0:
         require(False, "moments", "other than zero", m.tolist())
     first = None if initial is None else _finite("initial", initial, (POSE_SIZE * system.n_epm,), leading)
     return u_d, p, m, first
+
+
+def check_limits(tolerance: float, max_iterations: int) -> None:
+    """Raise ``InputError`` unless these are what a descent can stop at."""
+    require(0.0 <= tolerance < math.inf, "tolerance", "a finite number of at least 0", tolerance)
+    whole = is_whole(max_iterations) and max_iterations >= 0
+    require(whole, "max_iterations", "a whole number of at least 0", max_iterations)
 
 
 def draw_starts(system: System, starts: int, seed: int | np.random.Generator, warm: bool) -> Floats:

@@ -456,7 +456,7 @@ def test_a_new_run_never_takes_the_folder_of_an_old_one(config: MakeConfig, tmp_
     train(config())
     before = files_of(config().out)
     for again in (config(seed=1), going_on(config().out, steps=640, out=config().out.parent / "other")):
-        (tmp_path / "other" / "checkpoints").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "other" / "model").mkdir(parents=True, exist_ok=True)
         with pytest.raises(ValueError, match=r"^Input out must be a folder without a run"):
             train(again)
     assert files_of(config().out) == before
@@ -475,6 +475,47 @@ def test_two_runs_begun_at_once_have_folders_of_their_own(config: MakeConfig, mo
     outer, _ = train(config(steps=128, out=None, seed=1))
     assert (outer, inner[0]) == (Path("runs/train"), Path("runs/train-2"))
     assert [load_card(folder / "model").config["seed"] for folder in (outer, inner[0])] == [1, 0]
+
+
+def test_a_run_in_training_cannot_be_gone_on_with(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(config())
+    original = PPO.learn
+    tried = []
+
+    def learn(model: PPO, *arguments: Any, **options: Any) -> PPO:
+        if not tried:
+            tried.append(True)
+            with pytest.raises(ValueError, match=r"^Input resume must be a run at rest; instead received .+"):
+                train(going_on(config().out, steps=1024))
+        return original(model, *arguments, **options)
+
+    monkeypatch.setattr(PPO, "learn", learn)
+    train(going_on(config().out, steps=640))
+    assert tried
+    assert steps_of(config().out)[-1] == 640
+
+
+def test_checkpoints_come_ten_times_a_run_or_more() -> None:
+    assert TrainConfig().checkpoint_steps == 250_000
+    assert TrainConfig(algo="sac").checkpoint_steps == 20_000
+    assert TrainConfig(steps=5).checkpoint_steps == 1
+    assert TrainConfig(checkpoint_every=7).checkpoint_steps == 7
+
+
+def test_a_run_killed_before_its_first_checkpoint_leaves_its_folder_free(config: MakeConfig) -> None:
+    folder = config().out
+    killed = KILLED.replace("files == 4", "files == 1")
+    done = subprocess.run(
+        [sys.executable, "-c", killed, str(folder)],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    assert not checkpoints(folder)
+    assert train(config()) == (folder, True)
 
 
 def test_after_a_kill_progress_tells_only_what_counts(config: MakeConfig) -> None:
