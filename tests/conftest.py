@@ -10,8 +10,10 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["MPLBACKEND"] = "Agg"
 
+import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,9 +24,18 @@ import magenv
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, Body, Plant
 
+if TYPE_CHECKING:
+    from rollouts import MakeEnv
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecNormalize
+    from tiny_runs import MakeConfig
+
+    from agents.configs import TrainConfig
+
 Floats = NDArray[np.float64]
-MakeEnv = Callable[..., TwoRobots]
 Rotation = Callable[[float], Floats]
+
+pytest.register_assert_rewrite("lane", "messages", "rollouts", "tiny_runs")  # so that their asserts tell values
 
 
 @pytest.fixture
@@ -72,3 +83,54 @@ def turn_about_z() -> Rotation:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     return matrix
+
+
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pygame no display to open: only what asks for a window may need one."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in a folder of the test's own, so that default folders are not the project's."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def make_config(tmp_path: Path) -> MakeConfig:
+    """Return a tiny training's configuration with changes, its run in the folder ``run``."""
+    from tiny_runs import CONFIGS  # which imports torch; most tests do without
+
+    def make(algo: str = "ppo", **changes: Any) -> TrainConfig:
+        return dataclasses.replace(CONFIGS[algo], **({"out": tmp_path / "run"} | changes))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def trained() -> dict[str, tuple[BaseAlgorithm, VecNormalize]]:
+    """Return agents of both algorithms after a few gradient steps."""
+    from tiny_runs import SAVED
+
+    from agents.learning import build
+
+    made = {}
+    for algo, config in SAVED.items():
+        model, env = build(config)
+        model.learn(128)
+        env.training = False
+        made[algo] = (model, env)
+    return made
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path, trained: dict[str, tuple[BaseAlgorithm, VecNormalize]]) -> Path:
+    """Return a sound PPO checkpoint."""
+    from tiny_runs import SAVED
+
+    from agents.checkpoints import save_model
+
+    path = tmp_path / "checkpoints" / "step-000000000128"
+    save_model(path, *trained["ppo"], SAVED["ppo"], True, "python train.py")
+    return path

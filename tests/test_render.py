@@ -1,38 +1,26 @@
-"""Pictures: to scale, the same for the same state, without a display, and out of the way of whoever does not draw."""
+"""Pictures of scenes: to scale, the same for the same scene; the window they are shown in."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import magenv
-from magenv.episodes import Episodes, Settings
 from magenv.params import PLANTS, System
 from magenv.render import RENDER_FPS, ROBOT_COLOURS, Renderer
-from magenv.scene import Scene, scene_of
+from magenv.scene import Scene
 from magenv.trajectories import approach
 from magenv.world import LOSSES
+
+pytestmark = pytest.mark.usefixtures("no_display")
 
 Picture = NDArray[np.uint8]
 
 PLANT = PLANTS["paper"]
 HEIGHT = 800
 MOVE_M = 0.02
-FAR = np.array([0.0, 0.0, 1.0, 0.0, 0.0] * 2, np.float32)
-"""Action that sends the EPMs far away, so that the robots take a while to get lost."""
-
-
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave pygame no display to open: only what asks for a window may need one."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
 
 
 def a_scene(n_epm: int = 2, time_s: float = 50.0) -> Scene:
@@ -208,45 +196,6 @@ def test_trails_grow_restart_forgets_them_and_another_path_replaces_the_first() 
     assert (drawn(later) != drawn(replace(later, path=scene.path))).any()
 
 
-def test_errors_are_those_of_the_world_also_at_a_loss() -> None:
-    episodes = Episodes(1, Settings("approach-30"))
-    episodes.seed(0, np.random.default_rng(0))
-    episodes.start(np.ones(1, np.bool_))
-    world, active = episodes.world, np.ones(1, np.bool_)
-    kept = 0
-    scene = scene_of(world, 0)
-    while not scene.loss:
-        episodes.step(FAR[None], active)
-        terminated = episodes.outcome()[1]
-        scene = scene_of(world, 0)
-        assert scene.position_error_m == pytest.approx(world.measurements.position_error_end_m[0], rel=1e-9)
-        assert scene.heading_error_rad == pytest.approx(world.measurements.heading_error_end_rad[0], rel=1e-9)
-        kept += not terminated[0]
-        assert bool(terminated[0]) == (scene.loss > 0)
-    assert kept > 0
-    apart = world.robots[0, 1, :2] - world.robots[0, 0, :2]
-    assert scene.separation_m == pytest.approx(float(np.hypot(*apart)))
-    episodes.seed(0, np.random.default_rng(0))
-    episodes.start(np.ones(1, np.bool_))
-    assert scene_of(world, 0).loss == 0
-
-
-def test_a_scene_does_not_follow_the_world() -> None:
-    episodes = Episodes(2, Settings("approach-60"))
-    for row in range(2):
-        episodes.seed(row, np.random.default_rng(row))
-    episodes.start(np.ones(2, np.bool_))
-    scene = scene_of(episodes.world, 1)
-    names = ("robots", "reference", "path", "epm_positions", "epm_directions")
-    before = {name: getattr(scene, name).copy() for name in names}
-    np.testing.assert_array_equal(scene.robots, episodes.world.robots[1, :, :3])
-    episodes.world.robots += 1.0
-    episodes.world.epms += 1.0
-    episodes.world.coefficients += 1.0
-    for name in names:
-        np.testing.assert_array_equal(getattr(scene, name), before[name])
-
-
 @pytest.mark.parametrize("name", ["robots", "reference", "path", "epm_positions", "epm_directions", "loss"])
 def test_a_malformed_scene_is_refused(name: str) -> None:
     wrong = len(LOSSES) if name == "loss" else np.zeros(7)
@@ -260,21 +209,6 @@ def test_a_burst_state_is_drawn_without_its_robots(value: float) -> None:
     robots[1] = value
     picture = drawn(replace(bare_scene(), robots=robots, loss=1))
     assert len(new_pixels(picture, drawn(bare_scene()), 0)) > 300
-
-
-def test_rgb_array_of_the_environment_needs_no_display() -> None:
-    import pygame
-
-    env = gymnasium.make(magenv.ENV_ID, scenario="approach-60", render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    assert isinstance(first, np.ndarray)
-    env.step(FAR)
-    assert not np.array_equal(np.asarray(env.render()), first)
-    assert not pygame.display.get_init()
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.render(), first)  # the trail is a new one
-    env.close()
 
 
 def test_window_shows_at_the_frame_rate_and_closes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,34 +235,3 @@ def test_window_shows_at_the_frame_rate_and_closes_twice(monkeypatch: pytest.Mon
     renderer.draw(a_scene())  # a closed renderer leaves the next one's window alone
     assert len(flips) == 3
     other.close()
-
-
-@pytest.mark.parametrize("by_user", [True, False])
-def test_a_window_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch, by_user: bool) -> None:
-    import pygame
-
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = gymnasium.make(magenv.ENV_ID, scenario="approach-60", render_mode="human")
-    env.reset(seed=0)
-    if by_user:
-        pygame.event.post(pygame.event.Event(pygame.QUIT))
-    else:
-        pygame.display.quit()
-    for _ in range(2):
-        env.step(FAR)
-    assert not pygame.display.get_init()
-    env.reset(seed=1)
-    env.close()
-    env.close()
-
-
-def test_importing_the_environment_imports_no_plotting_library() -> None:
-    code = (
-        "import sys, magenv.env, magenv.vector_env\n"
-        "print(sorted({'pygame', 'matplotlib', 'torch'} & set(sys.modules)))\n"
-        "from magenv.params import PLANTS, System\n"
-        "magenv.render.Renderer(System(), PLANTS['paper'], window=False)\n"
-        "print(sorted({'pygame', 'matplotlib', 'torch'} & set(sys.modules)))\n"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=dict(os.environ))
-    assert run.stdout.splitlines() == ["[]", "['pygame']"]

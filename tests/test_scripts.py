@@ -1,4 +1,4 @@
-"""The two commands as a user meets them: what they write, how they end, what they say when something is wrong."""
+"""The two commands as a user meets them: what they write, how they end, what they tell."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny_runs import OPTIONS
 
 from agents.checkpoints import checkpoints, stored_config
 from agents.command import friendly
@@ -26,10 +27,6 @@ from magenv.params import InputError
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "80"}
-TINY = [
-    *("--ppo.n-envs", "8", "--ppo.n-steps", "16", "--ppo.batch-size", "64", "--ppo.n-epochs", "1"),
-    *("--ppo.net", "16", "16"),
-]
 SHORT = """
 import sys
 sys.argv[0] = "train.py"
@@ -103,11 +100,6 @@ def summary(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def tree(folder: Path) -> dict[str, bytes]:
-    """Return all files below a folder."""
-    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 # As a process.
 
 
@@ -159,7 +151,7 @@ def test_evaluate_leaves_out_agents_made_for_another_system(
 
 def test_train_trains_compares_and_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    done = call(tmp_path, "short", *TINY, "--steps", "256", "--checkpoint-every", "128", "--out", str(out))
+    done = call(tmp_path, "short", *OPTIONS, "--steps", "256", "--checkpoint-every", "128", "--out", str(out))
     assert done.returncode == 0, done.stderr
     assert load_card(out / "model").steps == 256
     assert load_card(out / "model").command.startswith("python train.py --ppo.n-envs 8")
@@ -179,7 +171,7 @@ def test_ctrl_c_in_train_leaves_a_model_and_a_checkpoint(
     tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
 ) -> None:
     out = tmp_path / "run"
-    process = start("train.py", *TINY, "--steps", "10000000", "--checkpoint-every", "256", "--out", str(out))
+    process = start("train.py", *OPTIONS, "--steps", "10000000", "--checkpoint-every", "256", "--out", str(out))
     wait_for(lambda: bool(checkpoints(out)), process)
     process.send_signal(signal.SIGINT)
     told, errors = process.communicate(timeout=60)
@@ -214,9 +206,6 @@ def test_ctrl_c_in_evaluate_leaves_a_report_of_what_was_done(
     assert "idle" in told
 
 
-# Bad input: one line, exit code 2, nothing written.
-
-
 @pytest.mark.parametrize("arguments", [["--controllers", "idle", "--scenarios", "approach-5"], ["--episodes", "many"]])
 def test_bad_input_ends_the_process_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
     done = call(tmp_path, "evaluate.py", *arguments)
@@ -226,96 +215,7 @@ def test_bad_input_ends_the_process_with_one_line(tmp_path: Path, arguments: lis
     assert not list(tmp_path.iterdir())
 
 
-BAD = {
-    "controller": ("evaluate.py", ["--controllers", "nobody"], "baseline.*'nobody'"),
-    "no controller": ("evaluate.py", ["--controllers"], "controllers"),
-    "controller twice": ("evaluate.py", ["--controllers", "idle", "idle"], "each once.*'idle', 'idle'"),
-    "scenario": ("evaluate.py", ["--controllers", "idle", "--scenarios", "approach-60", "line"], "approach.*'line'"),
-    "scenario twice": ("evaluate.py", ["--controllers", "idle", "--scenarios", "random", "random"], "each once"),
-    "controllers of one file": ("evaluate.py", ["--controllers", "id-le", "id/le"], "'id-le'"),
-    "seed too large": ("evaluate.py", ["--controllers", "idle", "--seed", str(2**63 - 1)], "4294967295"),
-    "plant": ("evaluate.py", ["--controllers", "idle", "--plant", "moon"], "paper.*'moon'"),
-    "episodes": ("evaluate.py", ["--controllers", "idle", "--episodes", "0"], "at least 1.*0"),
-    "seed": ("evaluate.py", ["--controllers", "idle", "--seed", "-1"], "from 0 to .*-1"),
-    "n_epm 0": ("evaluate.py", ["--controllers", "idle", "--n-epm", "0"], "2 or 3.*0"),
-    "n_epm 0 of the baseline": ("evaluate.py", ["--controllers", "baseline", "--n-epm", "0"], "n_epm.*0"),
-    "n_epm 1": ("evaluate.py", ["--controllers", "idle", "--n-epm", "1"], "2 or 3.*1"),
-    "control_hz": ("evaluate.py", ["--controllers", "idle", "--control-hz", "0"], "control_hz.*0.0"),
-    "no model": ("evaluate.py", ["--controllers", "runs/nothing"], "model's folder.*'runs/nothing'"),
-    "option": ("evaluate.py", ["--controler", "idle"], "--controler"),
-    "number": ("evaluate.py", ["--n-epm", "two"], "n-epm must be a whole number; instead received 'two'"),
-    "algorithm": ("train.py", ["--algo", "dqn"], "'dqn'.*ppo.*sac"),
-    "train scenario": ("train.py", ["--scenario", "line"], "approach.*'line'"),
-    "train plant": ("train.py", ["--plant", "moon"], "paper.*'moon'"),
-    "train n_epm": ("train.py", ["--n-epm", "0"], "2 or 3.*0"),
-    "train action": ("train.py", ["--action", "jump"], "'jump'.*home"),
-    "train steps": ("train.py", ["--steps", "0"], "error: Input steps must be a whole number of at least 1.*0"),
-    "train steps, words": ("train.py", ["--steps", "abc"], "steps must be a whole number; instead received 'abc'"),
-    "train seed": ("train.py", ["--seed", "-1"], "from 0 to 4294967295; instead received -1"),
-    "train gamma": ("train.py", ["--ppo.gamma", "2"], "error: Input gamma must be .* at most 1.*2"),
-    "train net": ("train.py", ["--ppo.net", "0"], "widths.*0"),
-    "tune candidates": ("agents/tune.py", ["--candidates", "0"], "candidates.*at least 1.*0"),
-    "train resume": ("train.py", ["--resume", "runs/nothing"], "checkpoints.*'runs/nothing'"),
-}
-
-
-def refused(
-    script: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> str:
-    """Run a script in this process, which must end with exit code 2 and one line; return the line."""
-    monkeypatch.setattr(sys, "argv", [script, *arguments])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(ROOT / script), run_name="__main__")
-    told = capfd.readouterr()
-    assert end.value.code == 2
-    assert told.out == ""
-    assert told.err.endswith("\n")
-    assert len(told.err.splitlines()) == 1, told.err
-    return told.err
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_told_in_one_line_and_nothing_is_written(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    script, arguments, pattern = BAD[case]
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "evaluate").mkdir(parents=True)
-    (tmp_path / "runs" / "evaluate" / "summary.json").write_text("{}")
-    before = tree(tmp_path)
-    line = refused(script, arguments, monkeypatch, capfd)
-    assert re.search(pattern, line), line
-    assert tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
-@pytest.mark.parametrize("kind", ["a file", "below a file", "a file of /proc"])
-def test_an_out_folder_that_cannot_be_written_is_refused(
-    script: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    precious = tmp_path / "precious"
-    precious.write_text("ten years")
-    out = {"a file": precious, "below a file": precious / "out", "a file of /proc": Path("/proc/self/out")}[kind]
-    arguments = ["--controllers", "idle", "--episodes", "1"] if script == "evaluate.py" else ["--steps", "64", *TINY]
-    line = refused(script, [*arguments, "--out", str(out)], monkeypatch, capfd)
-    assert "Input out must be" in line
-    assert str(out) in line
-    assert precious.read_text() == "ten years"
-
-
-@pytest.mark.parametrize("content", [b"\x80\x04K\x00.", b"{}", b"PK\x03\x04", b""])
-def test_a_foreign_model_is_refused(
-    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "card.json").write_bytes(content)
-    before = tree(tmp_path)
-    line = refused(
-        "evaluate.py", ["--controllers", str(tmp_path / "model"), "--out", str(tmp_path / "out")], monkeypatch, capfd
-    )
-    assert "Input model must" in line
-    assert tree(tmp_path) == before
-    assert not (tmp_path / "out").exists()
+# Errors and help.
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,42 @@
+"""One lane of the plant, stepped by the integrator alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.dynamics import Physics, advance, constants, may_touch
+from magenv.lanes import CONSTANTS, CONSTANTS_SIZE, EPMS, fields
+from magenv.params import Plant, System
+from magenv.poses import pose_bounds, project, to_cartesian
+
+Floats = NDArray[np.float64]
+
+SYSTEM = System()
+
+
+def magnets(rng: np.random.Generator, system: System = SYSTEM) -> Floats:
+    """Allowed EPMs (N, 6)."""
+    pose, _ = project(rng.uniform(*pose_bounds(system)), system)
+    return np.concatenate(to_cartesian(pose), axis=-1)
+
+
+def one_lane(robots: Floats, epms: Floats, physics: Physics, h: float) -> Floats:
+    """A single lane (fields, 1) with these robots (2, 6) and EPMs (N, 6)."""
+    lane, row = np.zeros((fields(len(epms)), 1)), np.empty((1, CONSTANTS_SIZE))
+    constants(physics, h, row)
+    lane[:12, 0] = robots.reshape(-1)
+    lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row
+    lane[EPMS:, 0] = (epms * ([1.0] * 3 + [physics.epm_moment[0]] * 3)).reshape(-1)
+    return lane
+
+
+def run(robots: Floats, epms: Floats, plant: Plant, h: float, steps: int, system: System = SYSTEM) -> Floats:
+    """Return the states (steps + 1, 2, 6) of a run without contact."""
+    lane = one_lane(robots, epms, Physics.of(system, plant, 1), h)
+    path = [robots.copy()]
+    for _ in range(steps):
+        advance(lane, 0, len(epms), h)
+        assert not may_touch(lane, 0, plant.body.diameter_m, plant.workspace_radius_m)
+        path.append(lane[:12, 0].reshape(2, 6).copy())
+    return np.array(path)

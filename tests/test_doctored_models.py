@@ -1,0 +1,191 @@
+"""A doctored model is refused in one line, and runs nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from messages import refusal
+from safetensors.torch import load_file, save_file
+
+from agents.catalogue import controller
+from agents.checkpoints import stored_config
+from agents.learned import Learned
+from agents.store import CARD, POLICY, TRAINING, load_training
+
+
+class Bomb:
+    """Makes a file when unpickled."""
+
+    def __init__(self, canary: Path) -> None:
+        self._canary = canary
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self._canary,)
+
+
+def bombs(canary: Path, work: Path) -> dict[str, bytes]:
+    """Return files that make the canary when a careless reader opens them."""
+    torch.save({"policy.log_std": Bomb(canary)}, work / "bomb.pt")
+    np.save(work / "bomb.npy", np.array([Bomb(canary)], dtype=object), allow_pickle=True)
+    found = {
+        "pickle": pickle.dumps(Bomb(canary)),
+        "torch": (work / "bomb.pt").read_bytes(),
+        "numpy": (work / "bomb.npy").read_bytes(),
+        "python": f"open({str(canary)!r}, 'w')".encode(),
+    }
+    for name in ("bomb.pt", "bomb.npy"):
+        (work / name).unlink()
+    return found
+
+
+def test_the_bombs_are_live(tmp_path: Path) -> None:
+    canary = tmp_path / "canary"
+    made = bombs(canary, tmp_path)
+    assert not canary.exists()
+    pickle.loads(made["pickle"])
+    assert canary.exists()
+
+
+@pytest.mark.parametrize("kind", ["pickle", "torch", "numpy", "python", "random", "empty", "header", "truncated"])
+@pytest.mark.parametrize("name", [CARD, POLICY, TRAINING])
+def test_a_doctored_file_is_refused_and_runs_nothing(checkpoint: Path, tmp_path: Path, name: str, kind: str) -> None:
+    canary = tmp_path / "canary"
+    sound = (checkpoint / name).read_bytes()
+    files = bombs(canary, tmp_path) | {
+        "random": np.random.default_rng(0).bytes(5000),
+        "empty": b"",
+        "header": (2**62).to_bytes(8, "little") + b"{}",
+        "truncated": sound[: len(sound) - 40],
+    }
+    (checkpoint / name).write_bytes(files[kind])
+    if name == TRAINING:
+        refusal(lambda: load_training(checkpoint))
+        Learned(checkpoint)  # does not even open it
+    else:
+        refusal(lambda: Learned(checkpoint))
+        refusal(lambda: controller(str(checkpoint)))
+    if name == CARD:
+        refusal(lambda: stored_config(tmp_path))
+    assert not canary.exists()
+
+
+def changed(checkpoint: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Rewrite the checkpoint's card with a change."""
+    card = json.loads((checkpoint / CARD).read_text())
+    change(card)
+    (checkpoint / CARD).write_text(json.dumps(card))
+
+
+DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "no format": lambda card: card.pop("format"),
+    "other format": lambda card: card.update(format="magenv model 99"),
+    "unknown key": lambda card: card.update(hook="os.system('true')"),
+    "no settings": lambda card: card.pop("settings"),
+    "unknown setting": lambda card: card["settings"].update(hook=1),
+    "settings a list": lambda card: card.update(settings=[1, 2]),
+    "foreign algorithm": lambda card: card.update(algo="dqn"),
+    "algorithm a list": lambda card: card.update(algo=["ppo"]),
+    "other algorithm": lambda card: card.update(algo="sac"),
+    "no net": lambda card: card.pop("net"),
+    "empty net": lambda card: card.update(net=[]),
+    "narrower net": lambda card: card.update(net=[8, 8]),
+    "deeper net": lambda card: card.update(net=[16, 8, 8]),
+    "huge net": lambda card: card.update(net=[10**7, 10**7]),
+    "negative net": lambda card: card.update(net=[-1, 8]),
+    "net a text": lambda card: card.update(net="os"),
+    "net a number": lambda card: card.update(net=64),
+    "a net of truths": lambda card: card.update(net=[True, True]),
+    "fractional net": lambda card: card.update(net=[16.5, 8]),
+    "steps a text": lambda card: card.update(steps="many"),
+    "config a text": lambda card: card.update(config="none"),
+    "other n_epm": lambda card: card["settings"].update(n_epm=3),
+    "impossible n_epm": lambda card: card["settings"].update(n_epm=10**6),
+    "n_epm a text": lambda card: card["settings"].update(n_epm="2"),
+    "foreign plant": lambda card: card["settings"].update(plant="moon"),
+    "plant a list": lambda card: card["settings"].update(plant=["paper"]),
+    "foreign scenario": lambda card: card["settings"].update(scenario="approach-5"),
+    "foreign action": lambda card: card["settings"].update(action="jump"),
+    "other action": lambda card: card["settings"].update(action="wrench"),
+    "other observation": lambda card: card["settings"].update(observation="errors"),
+    "foreign frame": lambda card: card["settings"].update(frame="lab"),
+    "control_hz a text": lambda card: card["settings"].update(control_hz="2.0"),
+    "control_hz null": lambda card: card["settings"].update(control_hz=None),
+    "control_hz zero": lambda card: card["settings"].update(control_hz=0.0),
+    "control_hz infinite": lambda card: card["settings"].update(control_hz=math.inf),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_damaged_card_is_refused(checkpoint: Path, damage: str) -> None:
+    changed(checkpoint, DAMAGED[damage])
+    refusal(lambda: Learned(checkpoint))
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '"magenv model 1"', "{}", "{" * 10_000, "[" * 100_000, "\x00", "NaN"])
+def test_a_card_that_is_no_card_is_refused(checkpoint: Path, text: str) -> None:
+    (checkpoint / CARD).write_text(text)
+    refusal(lambda: Learned(checkpoint))
+
+
+def without(name: str) -> Callable[[dict[str, torch.Tensor]], object]:
+    return lambda tensors: tensors.pop(name)
+
+
+def with_value(name: str, value: torch.Tensor) -> Callable[[dict[str, torch.Tensor]], object]:
+    return lambda tensors: tensors.update({name: value})
+
+
+FOREIGN: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
+    "no mean": without("observation.mean"),
+    "no variance": without("observation.variance"),
+    "no count": without("observation.count"),
+    "no log_std": without("policy.log_std"),
+    "an extra tensor": with_value("policy.extra", torch.zeros(3)),
+    "a shape": with_value("policy.log_std", torch.zeros(11)),
+    "weights not finite": with_value("policy.log_std", torch.full((10,), math.nan)),
+    "a short mean": with_value("observation.mean", torch.zeros(62, dtype=torch.float64)),
+    "a mean not finite": with_value("observation.mean", torch.full((63,), math.inf, dtype=torch.float64)),
+    "a variance not finite": with_value("observation.variance", torch.full((63,), math.nan, dtype=torch.float64)),
+    "a negative variance": with_value("observation.variance", -torch.ones(63, dtype=torch.float64)),
+    "a mean in bfloat16": with_value("observation.mean", torch.zeros(63, dtype=torch.bfloat16)),
+    "weights in float8": with_value("policy.log_std", torch.zeros(10).to(torch.float8_e4m3fn)),
+    "complex weights": with_value("policy.log_std", torch.zeros(10, dtype=torch.complex64)),
+    "weights that overflow": lambda tensors: [
+        value.fill_(3e38) for name, value in tensors.items() if name.startswith("policy.")
+    ],
+    "an empty count": with_value("observation.count", torch.zeros(0, dtype=torch.float64)),
+    "a count not finite": with_value("observation.count", torch.tensor([math.nan], dtype=torch.float64)),
+}
+
+
+@pytest.mark.parametrize("damage", FOREIGN)
+def test_foreign_weights_are_refused(checkpoint: Path, damage: str) -> None:
+    tensors = load_file(checkpoint / POLICY)
+    FOREIGN[damage](tensors)
+    save_file(tensors, checkpoint / POLICY)
+    refusal(lambda: Learned(checkpoint))
+
+
+def test_a_missing_model_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+    for name in (tmp_path / "nowhere", tmp_path, checkpoint / CARD):
+        assert str(name) in refusal(lambda name=name: Learned(name))  # type: ignore[misc]
+        assert str(name) in refusal(lambda name=name: controller(str(name)))  # type: ignore[misc]
+    (checkpoint / POLICY).unlink()
+    assert POLICY in refusal(lambda: Learned(checkpoint))
+    assert "baseline" in refusal(lambda: controller("nobody"))
+
+
+def test_an_agent_refuses_what_it_was_not_made_for(checkpoint: Path) -> None:
+    assert controller(str(checkpoint), 2, 2.0).action == "home"
+    assert "n_epm" in refusal(lambda: controller(str(checkpoint), 3))
+    assert "control_hz" in refusal(lambda: controller(str(checkpoint), 2, 10.0))
+    with pytest.raises(ValueError, match="shape"):
+        Learned(checkpoint).predict(np.zeros((2, 70), np.float32))
