@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magenv.allocation_input import check_limits, checked_problem, draw_starts
-from magenv.allocation_scipy import trust_constr
+from magenv.allocation_scipy import ScipyMethod, scipy_best_of
 from magenv.kernels import kernel
 from magenv.params import System, common_shape, require
 from magenv.solver import best_of
@@ -23,7 +24,7 @@ from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
-Method = Literal["interior-point", "trust-constr"]
+Method = Literal["interior-point"] | ScipyMethod
 
 FORCE_SCALE_N = 0.5
 TORQUE_SCALE_NM = 0.05
@@ -75,26 +76,28 @@ class Solutions:
     """Starts that were run (...)."""
 
 
-@kernel
-def target_norm(target: Floats, scale: Floats) -> float:
-    """Return the norm of the scaled target (10,), at least ``_NORM_FLOOR``."""
-    squared = 0.0
-    for i in range(WRENCH_SIZE):
-        squared += (scale[i] * target[i]) ** 2
-    return max(math.sqrt(squared), _NORM_FLOOR)
-
-
 def component_scales(force_scale_n: float = FORCE_SCALE_N, torque_scale_nm: float = TORQUE_SCALE_NM) -> Floats:
     """Return what each component of U is divided by (10), N m and N."""
     robot = [torque_scale_nm, torque_scale_nm, force_scale_n, force_scale_n, force_scale_n]
     return np.array(robot + robot)
 
 
-def _weights(force_scale_n: float, torque_scale_nm: float) -> Floats:
-    """Return S (10), 1/N m and 1/N."""
+@kernel
+def _scale_errors(target: Floats, force_scale_n: float, torque_scale_nm: float, scale: Floats) -> float:
+    """Write S over the norm of the scaled target (10,), by which errors become relative; return that norm."""
+    squared = 0.0
+    for i in range(WRENCH_SIZE):
+        scale[i] = 1.0 / (torque_scale_nm if i % 5 < 2 else force_scale_n)
+        squared += (scale[i] * target[i]) ** 2
+    norm = max(math.sqrt(squared), _NORM_FLOOR)
+    for i in range(WRENCH_SIZE):
+        scale[i] /= norm
+    return norm
+
+
+def _check_scales(force_scale_n: float, torque_scale_nm: float) -> None:
     for name, number in (("force_scale_n", force_scale_n), ("torque_scale_nm", torque_scale_nm)):
         require(math.isfinite(number) and number > 0, name, "a positive, finite number", number)
-    return 1.0 / component_scales(force_scale_n, torque_scale_nm)
 
 
 def _limits(system: System) -> Floats:
@@ -110,7 +113,8 @@ def _allocate_rows(
     moments: Floats,
     epm_moment: float,
     limits: Floats,
-    scale: Floats,
+    force_scale_n: float,
+    torque_scale_nm: float,
     tolerance: float,
     max_iterations: int,
     stop_early: bool,
@@ -131,22 +135,20 @@ def _allocate_rows(
     # Arrays of the thread alone: views of shared ones share a reference count, which cores would fight over.
     target, position, moment, bounds = np.empty(WRENCH_SIZE), np.empty((2, 3)), np.empty((2, 3)), limits.copy()
     pose, wrench = np.empty(poses.shape[1]), np.empty(WRENCH_SIZE)
-    starts, row_scale = np.empty((warm + len(random), poses.shape[1])), np.empty(WRENCH_SIZE)
+    starts, scale = np.empty((warm + len(random), poses.shape[1])), np.empty(WRENCH_SIZE)
     for i in range(first, last):
         if warm:
             starts[0] = initial[i]
         starts[warm:] = random
         target[:], position[:], moment[:] = targets[i], positions[i], moments[i]
-        norms[i] = target_norm(target, scale)
-        for j in range(WRENCH_SIZE):
-            row_scale[j] = scale[j] / norms[i]
+        norms[i] = _scale_errors(target, force_scale_n, torque_scale_nm, scale)
         cost, counts[i, 0], counts[i, 1], counts[i, 2] = best_of(
             target,
             position,
             moment,
             epm_moment,
             bounds,
-            row_scale,
+            scale,
             tolerance,
             max_iterations,
             stop_early,
@@ -196,8 +198,8 @@ def allocate(
         Limit per start.
     force_scale_n, torque_scale_nm : float
         What forces and torques are divided by.
-    method : {"interior-point", "trust-constr"}
-        Ours, or SciPy's interior point on the same problem and starts, as a slow reference.
+    method : {"interior-point", "trust-constr", "SLSQP"}
+        Ours, or SciPy's interior point or sequential least squares on the same problem and starts, as slow references.
 
     Returns
     -------
@@ -209,22 +211,23 @@ def allocate(
     ValueError
         If a shape does not fit or a value is not finite.
     """
-    require(method in ("interior-point", "trust-constr"), "method", "interior-point or trust-constr", method)
+    known = method in ("interior-point", "trust-constr", "SLSQP")
+    require(known, "method", "interior-point, trust-constr or SLSQP", method)
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=False)
     check_limits(tolerance, max_iterations)
-    scale = _weights(force_scale_n, torque_scale_nm)
+    _check_scales(force_scale_n, torque_scale_nm)
     poses = draw_starts(system, starts, seed, first is not None)
     poses = poses.copy() if first is None else np.concatenate([first[None], poses])
-    norm = target_norm(u_d, scale)
-    best_pose, best_wrench = np.empty(poses.shape[1]), np.empty(WRENCH_SIZE)
-    solve = best_of if method == "interior-point" else trust_constr
+    best_pose, best_wrench, scale = np.empty(poses.shape[1]), np.empty(WRENCH_SIZE), np.empty(WRENCH_SIZE)
+    norm = _scale_errors(u_d, float(force_scale_n), float(torque_scale_nm), scale)
+    solve = best_of if method == "interior-point" else partial(scipy_best_of, method)
     cost, status, iterations, run = solve(
         u_d,
         p,
         m,
         system.epm_moment_am2,
         _limits(system),
-        scale / norm,
+        scale,
         tolerance,
         max_iterations,
         stop_early,
@@ -279,7 +282,7 @@ def allocate_batch(
     """
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=True)
     check_limits(tolerance, max_iterations)
-    scale = _weights(force_scale_n, torque_scale_nm)
+    _check_scales(force_scale_n, torque_scale_nm)
     drawn = draw_starts(system, starts, seed, first is not None)
     warm = np.empty(0) if first is None else first
     shape = common_shape(target=u_d.shape[:-1], positions=p.shape[:-2], moments=m.shape[:-2], initial=warm.shape[:-1])
@@ -299,7 +302,8 @@ def allocate_batch(
         m,
         system.epm_moment_am2,
         _limits(system),
-        scale,
+        float(force_scale_n),
+        float(torque_scale_nm),
         tolerance,
         max_iterations,
         stop_early,

@@ -36,33 +36,53 @@ def _seeded_starts(system: System, starts: int, seed: int) -> Floats:
 
 
 @kernel
-def _all_within(values: Floats, most: float) -> bool:
+def _all_within(values: Floats) -> bool:
     within = True
     for value in values:
-        within = within and abs(value) <= most  # false for NaN
+        within = within and abs(value) <= _MOST  # false for NaN
     return within
 
 
 @kernel
-def _least_size(first: Floats, second: Floats) -> float:
-    """Return the least squared length of ``first`` - ``second``, rows (n, 3)."""
-    least = math.inf
-    for i in range(len(first)):
+def _fault(target: Floats, positions: Floats, moments: Floats, initial: Floats) -> int:
+    """Return the index of the first rule in ``_RULES`` that flat arrays of problems break, -1 where none."""
+    if not _all_within(target):
+        return 0
+    if not _all_within(positions):
+        return 1
+    if not _all_within(moments):
+        return 2
+    for i in range(0, len(positions), 6):
         squared = 0.0
-        for k in range(3):
-            squared += (first[i, k] - second[i, k]) ** 2
-        least = min(least, squared)
-    return least
+        for k in range(i, i + 3):
+            squared += (positions[k] - positions[k + 3]) ** 2
+        if not squared > _LEAST_M**2:
+            return 3
+    for i in range(0, len(moments), 3):
+        if not moments[i] ** 2 + moments[i + 1] ** 2 + moments[i + 2] ** 2 > 0.0:
+            return 4
+    return -1 if _all_within(initial) else 5
 
 
-def _finite(name: str, value: ArrayLike, own: tuple[int, ...], leading: bool) -> Floats:
-    """Return ``value`` as an array of sane numbers of shape ``own``, or (..., *own) where leading axes are allowed."""
+_SANE = f"finite, of at most {_MOST:g} in size"
+_RULES = (
+    ("target", _SANE),
+    ("positions", _SANE),
+    ("moments", _SANE),
+    ("positions", f"of two robots over {_LEAST_M:g} m apart from each other"),
+    ("moments", "other than zero"),
+    ("initial", _SANE),
+)
+"""What the numbers must be."""
+_NONE = np.empty(0)
+
+
+def _shaped(name: str, value: ArrayLike, own: tuple[int, ...], leading: bool) -> Floats:
+    """Return ``value`` as an array of shape ``own``, or (..., *own) where leading axes are allowed."""
     array = np.ascontiguousarray(value, dtype=np.float64)
     axes = array.ndim - len(own)
-    fits = axes >= 0 and array.shape[axes:] == own and (leading or axes == 0)
-    require(fits, name, f"an array of shape {('...', *own) if leading else own}", array.shape)
-    if not _all_within(array.reshape(-1), _MOST):
-        require(False, name, f"finite, of at most {_MOST:g} in size", array.tolist())
+    if array.shape != own and not (leading and axes >= 0 and array.shape[axes:] == own):
+        require(False, name, f"an array of shape {('...', *own) if leading else own}", array.shape)
     return array
 
 
@@ -75,14 +95,14 @@ def checked_problem(
     leading: bool,
 ) -> tuple[Floats, Floats, Floats, Floats | None]:
     """Return the checked target, positions, moments and initial pose."""
-    u_d = _finite("target", target, (WRENCH_SIZE,), leading)
-    p, m = _finite("positions", positions, (2, 3), leading), _finite("moments", moments, (2, 3), leading)
-    pairs, rows = p.reshape(-1, 2, 3), m.reshape(-1, 3)
-    if not _least_size(pairs[:, 0], pairs[:, 1]) > _LEAST_M**2:
-        require(False, "positions", f"of two robots over {_LEAST_M:g} m apart from each other", p.tolist())
-    if not _least_size(rows, np.zeros_like(rows)) > 0.0:
-        require(False, "moments", "other than zero", m.tolist())
-    first = None if initial is None else _finite("initial", initial, (POSE_SIZE * system.n_epm,), leading)
+    u_d = _shaped("target", target, (WRENCH_SIZE,), leading)
+    p, m = _shaped("positions", positions, (2, 3), leading), _shaped("moments", moments, (2, 3), leading)
+    first = None if initial is None else _shaped("initial", initial, (POSE_SIZE * system.n_epm,), leading)
+    warm = _NONE if first is None else first
+    fault = _fault(u_d.reshape(-1), p.reshape(-1), m.reshape(-1), warm.reshape(-1))
+    if fault >= 0:
+        name, must_be = _RULES[fault]
+        require(False, name, must_be, {"target": u_d, "positions": p, "moments": m, "initial": warm}[name].tolist())
     return u_d, p, m, first
 
 

@@ -1,9 +1,10 @@
-"""SciPy's interior point on the allocation problem: a slow reference for the compiled solver, from the same starts."""
+"""SciPy on the allocation problem: a slow reference for the compiled solver, from the same starts."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,19 @@ from magenv.wrench import robot_wrench, wrench_jacobian
 
 Floats = NDArray[np.float64]
 
+ScipyMethod = Literal["trust-constr", "SLSQP"]
+
+_ENDS: dict[ScipyMethod, dict[str, float]] = {
+    "trust-constr": {"gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-12},
+    "SLSQP": {"ftol": 1e-16},
+}
+"""When a method counts as arrived: late enough that targets can be met within 1e-8."""
 _FEASIBLE_M = 1e-9
 """Shortfall of a gap up to which a result counts."""
 
 
-def trust_constr(
+def scipy_best_of(
+    method: ScipyMethod,
     target: Floats,
     positions: Floats,
     moments: Floats,
@@ -32,7 +41,7 @@ def trust_constr(
     best_pose: Floats,
     best_wrench: Floats,
 ) -> tuple[float, int, int, int]:
-    """Do what ``magenv.solver.best_of`` does with SciPy's trust-region interior-point method, without the images."""
+    """Do what ``magenv.solver.best_of`` does by a method of SciPy, without the images; all gradients are exact."""
     from scipy.optimize import Bounds, NonlinearConstraint, minimize  # a quarter of a second that no other needs
 
     r_min, r_max, gap = (float(limit) for limit in limits)
@@ -54,9 +63,23 @@ def trust_constr(
         squared: Floats = np.sum((centres[first] - centres[second]) ** 2, axis=-1)
         return (squared - gap**2) / (2 * gap)
 
+    def gap_slopes(x: Floats) -> Floats:
+        centres, _ = to_cartesian(x)
+        slopes = np.zeros((len(first), size))
+        for k, (azimuth, _, radius) in enumerate(x.reshape(-1, POSE_SIZE)[:, :3]):
+            px, py, pz = centres[k]
+            along = np.hypot(px, py)
+            raised = [-pz * np.cos(azimuth), -pz * np.sin(azimuth), along]
+            moves = np.array([[-py, px, 0.0], raised, centres[k] / radius])
+            for pair in np.flatnonzero((first == k) | (second == k)):
+                other = second[pair] if first[pair] == k else first[pair]
+                slopes[pair, POSE_SIZE * k : POSE_SIZE * k + 3] = moves @ (centres[k] - centres[other]) / gap
+        return slopes
+
     low, high = np.full(size, -np.inf), np.full(size, np.inf)
     low[2::POSE_SIZE], high[2::POSE_SIZE] = r_min, r_max
-    constraints = [NonlinearConstraint(gaps, 0.0, np.inf)] if len(first) else []
+    constraints = [NonlinearConstraint(gaps, 0.0, np.inf, jac=gap_slopes)] if len(first) else []
+    options: Any = {"maxiter": max_iterations, **_ENDS[method]}
     best, status, iterations, run = math.inf, ITERATION_LIMIT, 0, 0
     for start in poses:
         make_interior(start, r_min, r_max, gap)
@@ -69,16 +92,16 @@ def trust_constr(
                 cost,
                 start,
                 jac=gradient,
-                method="trust-constr",
+                method=method,
                 bounds=Bounds(low, high, keep_feasible=True),
                 constraints=constraints,
-                options={"maxiter": max_iterations, "gtol": 1e-10, "xtol": 1e-12, "barrier_tol": 1e-12},
+                options=options,
             )
         iterations += int(result.nit)
         run += 1
         if result.fun < best and gaps(result.x).min(initial=math.inf) >= -_FEASIBLE_M:
             best = float(result.fun)
-            at_rest = STATIONARY if result.status in (1, 2) else ITERATION_LIMIT
+            at_rest = STATIONARY if result.success else ITERATION_LIMIT
             status = CONVERGED if 2 * best <= tolerance**2 else at_rest
             best_pose[:] = result.x
         if stop_early and status == CONVERGED:

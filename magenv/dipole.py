@@ -208,7 +208,7 @@ def _compute(
     n = math.prod(shape) // 3
     for i, array in enumerate(arrays):
         if array.size == 3 and n != 1:  # a single row need not be repeated beyond a block
-            array = np.broadcast_to(array.reshape(3), (min(n, _BLOCK), 3))
+            array = array.reshape(1, 3).repeat(min(n, _BLOCK), axis=0)
         elif array.shape != shape:
             array = np.broadcast_to(array, shape)
         # One type of array, one compilation: contiguous, aligned and writeable ones pass as they are.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Integral, Real
 
 import numpy as np
@@ -44,7 +45,7 @@ def _is_number(value: object) -> bool:
 
 def is_whole(value: object) -> bool:
     """Return whether a value is a whole number by its type, Python's or numpy's, and no bool."""
-    return not isinstance(value, bool) and isinstance(value, Integral)
+    return isinstance(value, (int, Integral)) and not isinstance(value, bool)
 
 
 def _require_positive(**values: float) -> None:
@@ -110,12 +111,12 @@ class System:
         """Moment of a robot's magnet in A m^2."""
         return self.ipm.moment_am2
 
-    @property
+    @cached_property
     def epm_moment_am2(self) -> float:
         """Moment of each EPM in A m^2: the volume of two reference magnets shared by ``n_epm``."""
         return 2.0 / self.n_epm * self.reference_epm.moment_am2
 
-    @property
+    @cached_property
     def gap_min_m(self) -> float:
         """Least distance of two EPM centres in m: there, coaxial, they attract each other with ``attraction_max_n``."""
         return float((3 * MU_0 * self.epm_moment_am2**2 / (2 * math.pi * self.attraction_max_n)) ** 0.25)

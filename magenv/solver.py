@@ -17,7 +17,8 @@ References
 ----------
 Waechter and Biegler, Math. Program. 106 (2006), sections 2 and 3: primal-dual barrier, inertia, second-order
 correction. Nocedal and Wright, "Numerical Optimization" (2006), 10.3 and 19.3. Transtrum and Sethna (2012),
-arXiv:1201.5885: the correction as geodesic acceleration of Levenberg-Marquardt steps.
+arXiv:1201.5885: the correction as geodesic acceleration of Levenberg-Marquardt steps. Fan and Yuan, Computing 74
+(2005): damping in proportion to the squared error near a root.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ _MARGIN = 1e-3
 _LARGEST_PUSH = 1.01
 _INSIDE = 1e-12
 """Share by which the solver's own limits are narrower: what it returns is inside the true ones after rounding too."""
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-12
+_FIRST_DAMPING, _NEAR, _LEAST_DAMPING = 1e-2, 1e-2, 1e-12
+"""Where f is below the second, the first is as much smaller: warm starts then converge nearly as Newton's method."""
 _DAMPING_FALL, _DAMPING_RISE, _DAMPING_TRIALS = 0.2, 4.0, 14
 _BARRIER_SHARE, _BARRIER_FALL, _BARRIER_END = 0.1, 0.2, 1e-8
 """The barrier's largest share of f, the factor by which it falls, its share of f at which a start is at rest."""
@@ -71,13 +73,7 @@ _IMAGE_ROUNDS, _BETTER = 3, 0.999
 
 @kernel
 def descend(
-    problem: Problem,
-    tolerance: float,
-    max_iterations: int,
-    patience: int,
-    now: State,
-    model: Model,
-    tried: State,
+    problem: Problem, tolerance: float, max_iterations: int, patience: int, now: State, model: Model, tried: State
 ) -> tuple[float, int, int]:
     """Improve ``now``, whose points are strictly feasible, in place; return f, status, iterations.
 
@@ -89,7 +85,7 @@ def descend(
     now.slacks[2 * n :] = now.gaps
     barrier = _BARRIER_SHARE * cost / m
     model.duals[:] = barrier / now.slacks
-    damping, centred, before, slow = _FIRST_DAMPING, False, math.inf, 0
+    damping, centred, before, slow = _FIRST_DAMPING * min(1.0, cost / _NEAR), False, math.inf, 0
     for iteration in range(max_iterations):
         feasible = True
         for value in now.gaps:

@@ -156,6 +156,14 @@ def test_reachable_targets_agree_with_trust_constr(seed: int, n_epm: int) -> Non
     assert ours.relative_residual <= theirs.relative_residual + 1e-8
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_slsqp_ends_feasible_and_at_times_meets_the_target(seed: int) -> None:
+    problem = reachable(seed, 3)
+    theirs = allocate(*problem, seed=seed, starts=5, method="SLSQP", stop_early=True)
+    assert_consistent(theirs, problem)
+    assert theirs.relative_residual < 1e-8
+
+
 @pytest.mark.filterwarnings("ignore:delta_grad == 0.0:UserWarning")
 @pytest.mark.parametrize("n_epm", [2, 3])
 @pytest.mark.parametrize("seed", range(2))
