@@ -13,6 +13,7 @@ if ENV_ID not in registry:
         id=ENV_ID,
         entry_point="magenv.env:TwoRobots",
         vector_entry_point="magenv.vector_env:TwoRobotsVector",
+        order_enforce=False,  # the environment itself refuses what comes before ``reset``
     )
 
 __all__ = ["ENV_ID", "__version__"]

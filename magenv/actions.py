@@ -10,7 +10,7 @@ Mode    Size  An action is
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ _MAX_ITERATIONS = 60
 
 
 @kernel
-def _pose_rows(
+def pose_rows(
     first: int,
     last: int,
     active: Bools,
@@ -58,6 +58,7 @@ def _pose_rows(
     targets: Floats,
     projected: Bools,
 ) -> None:
+    """Write the EPMs (n, N, 6) at absolute poses: ``actions`` (n, 5 N) from ``low`` to ``high``."""
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
         if not active[i]:
@@ -71,7 +72,7 @@ def _pose_rows(
 
 
 @kernel
-def _step_rows(
+def step_rows(
     first: int,
     last: int,
     active: Bools,
@@ -81,6 +82,7 @@ def _step_rows(
     targets: Floats,
     projected: Bools,
 ) -> None:
+    """Write the EPMs (n, N, 6) whose poses differ by ``actions`` (n, 5 N) from those of ``epms``."""
     pose = np.empty(POSE_SIZE)
     for i in range(first, last):
         if not active[i]:
@@ -106,7 +108,7 @@ def planar_target(wrench: Floats, heading_1: float, heading_2: float, target: Fl
 
 
 @kernel
-def _wrench_rows(
+def wrench_rows(
     first: int,
     last: int,
     active: Bools,
@@ -121,6 +123,7 @@ def _wrench_rows(
     targets: Floats,
     projected: Bools,
 ) -> None:
+    """Write the EPMs (n, N, 6) that exert the wrenches ``actions`` (n, 6), as found from ``starts`` (k, 5 N)."""
     n_epm = targets.shape[1]
     size = POSE_SIZE * n_epm
     positions, moments = np.zeros((2, 3)), np.zeros((2, 3))
@@ -185,6 +188,20 @@ class Actions:
         self._starts = np.concatenate([self._home[None], self._home[None], fallback])
         self._scale = 1.0 / component_scales()
 
+    def constants(self) -> dict[str, Any]:
+        """Return what the kernels of all modes take that never changes, by the names of ``magenv.state.State``."""
+        return {
+            "home": self._home,
+            "low": self._low,
+            "high": self._high,
+            "limits": self._limits,
+            "wrench_starts": self._starts,
+            "wrench_scale": self._scale,
+            "ipm_moment": self._system.ipm_moment_am2,
+            "nominal_epm_moment": self._system.epm_moment_am2,
+            "home_epms": self.home_epms,
+        }
+
     def home(self, measured: Floats) -> Floats:
         """Return the EPMs (n, N, 6) at home for robots measured at (n, 2, 3)."""
         epms = np.empty((len(measured), self._system.n_epm, 6))
@@ -224,12 +241,12 @@ class Actions:
         if self.mode == "home":
             run(home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
         elif self.mode == "pose":
-            run(_pose_rows, n, active, actions, self._low, self._high, self._limits, targets, projected)
+            run(pose_rows, n, active, actions, self._low, self._high, self._limits, targets, projected)
         elif self.mode == "step":
-            run(_step_rows, n, active, actions, epms, self._limits, targets, projected)
+            run(step_rows, n, active, actions, epms, self._limits, targets, projected)
         else:
             run(
-                _wrench_rows,
+                wrench_rows,
                 n,
                 active,
                 actions,

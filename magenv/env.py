@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
-from magenv.episodes import Episodes, Settings, check_action
+from magenv.episode import Episode
+from magenv.episodes import Episodes, Settings
 from magenv.params import require
 from magenv.render import RENDER_FPS, Renderer
 from magenv.scene import scene_of
 from magenv.task import Frame, ObservationMode
-
-_ACTIVE = np.ones(1, np.bool_)
 
 
 class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -93,6 +92,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         require(render_mode in (None, *modes), "render_mode", "one of None, " + ", ".join(modes), render_mode)
         self.render_mode = render_mode
         self._episodes = Episodes(1, Settings(scenario, plant, n_epm, action, observation, frame, control_hz))
+        self._episode = Episode(self._episodes)
         self.layout = self._episodes.layout
         self.observation_space = self._episodes.observation_space
         self.action_space = self._episodes.action_space
@@ -108,13 +108,13 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.np_random is not self._drawn_from:
             self._drawn_from = self.np_random
             self._episodes.seed(0, self.np_random)
-        observations = self._episodes.start(_ACTIVE)
+        observation, info = self._episode.start()
         self._running = True
         if self._renderer is not None:
             self._renderer.restart()
         if self.render_mode == "human":
             self.render()
-        return observations[0], self._episodes.single_state()
+        return observation, info
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Command the EPMs for one control period.
@@ -128,21 +128,21 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if not self._running:
             raise RuntimeError("No episode is running; call reset() before step().")
-        episodes = self._episodes
-        observations = episodes.step(check_action(action, (episodes.actions.size,))[None], _ACTIVE)
-        reward, terminated, truncated, info = episodes.single_outcome()
+        observation, reward, terminated, truncated, info = self._episode.step(action)
         if terminated or truncated:
             self._running = False
             info["is_success"] = truncated
         if self.render_mode == "human":
             self.render()
-        return observations[0], reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: return an RGB array (h, w, 3), or show a window and return None."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array' given to gymnasium.make.")
             return None
+        if self._drawn_from is None:
+            raise RuntimeError("No episode has begun; call reset() before render().")
         if self._renderer is None:
             self._renderer = Renderer(self._episodes.system, self._episodes.plant, self.render_mode == "human")
         return self._renderer.draw(scene_of(self._episodes.world, 0))

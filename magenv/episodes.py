@@ -6,7 +6,6 @@ generator before the first action, whatever the controller does.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +14,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
-from magenv.kernels import kernel
 from magenv.params import PLANTS, InputError, System, TaskParams, choose, require
 from magenv.poses import POSE_SIZE
 from magenv.starts import Starts
-from magenv.steps import begin_episodes, step_kernel, tell_rows
+from magenv.state import State, packed
+from magenv.steps import begin_episodes, clip, step_kernel, tell_rows
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode
 from magenv.trajectories import named_trajectory
 from magenv.workers import Workers
@@ -64,20 +63,10 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
         raise InputError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
     if numbers.shape != shape:
         require(False, "action", f"an array of shape {shape}", numbers.shape)
-    if not _clip(numbers.ravel()):
+    if not clip(numbers.ravel()):
         numbers = np.array(action, dtype=np.float64)
         require(False, "action", "finite", numbers[~np.isfinite(numbers)][:3].tolist())
     return numbers
-
-
-@kernel
-def _clip(numbers: Floats) -> bool:
-    """Clip ``numbers`` (k,) to [-1, 1] in place; return whether all were finite."""
-    unfit = 0
-    for i in range(len(numbers)):
-        unfit += 0 if abs(numbers[i]) < math.inf else 1
-        numbers[i] = min(max(numbers[i], -1.0), 1.0)
-    return unfit == 0
 
 
 class Episodes:
@@ -110,70 +99,71 @@ class Episodes:
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.actions.size,), np.float32)
         self._shape = (n, self.layout.size)
-        self._every: Bools = np.ones(n, np.bool_)
-        self._measured: Floats = np.zeros((n, 2, 3))
-        self._before: Floats = np.zeros((n, 2, 3))
-        self._targets: Floats = np.zeros(self.world.epms.shape)
-        self._projected: Bools = np.zeros(n, np.bool_)
-        self._paid: Floats = np.zeros((len(REWARD_TERMS) + 1, n))  # the terms, then the reward
-        self._ended: Bools = np.zeros((2, n), np.bool_)  # terminated, truncated
-        self._time_s: Floats = np.zeros(n)
-        self._references: Floats = np.zeros((n, 2, 3))
-        self._poses: Floats = np.zeros((n, POSE_SIZE * settings.n_epm))
         self._starts = Starts(n, trajectory is None, self._workers)
-        w, starts, task = self.world, self._starts, self.task
-        # Arguments of the kernels, collected once: the arrays are the same ones at every step.
-        self._told = (
-            self._measured,
-            self._before,
-            w.coefficients,
-            w.duration_s,
-            w.step_count,
-            w.measurements.counts,
-            w.epms,
-            w.period_s,
-            w.substeps,
-            self.system.r_max_m,
-            settings.frame == "robots",
-            bounds,
-            self._time_s,
-            self._references,
-            self._poses,
+        self.state = self._state(n, bounds)
+        self._prepare()
+
+    def _state(self, n: int, bounds: Observations) -> State:
+        """Return the arrays of world, actions and starts, by name, with those of the task."""
+        w, system, task, physics, n_epm = self.world, self.system, self.task, self.world.physics, self.settings.n_epm
+        return State(
+            robots=w.robots,
+            epms=w.epms,
+            constants=w.constants,
+            mass=physics.mass,
+            epm_moment=physics.epm_moment,
+            coefficients=w.coefficients,
+            duration=w.duration_s,
+            step=w.step_count,
+            numbers=w.measurements.numbers,
+            counts=w.measurements.counts,
+            period=w.period_s,
+            substeps=w.substeps,
+            loss_distance=task.loss_distance_m,
+            tracking_distance=task.tracking_distance_m,
+            diameter=physics.body_diameter,
+            wall_radius=physics.wall_radius,
+            targets=np.zeros(w.epms.shape),
+            projected=np.zeros(n, np.bool_),
+            **self.actions.constants(),
+            offsets=self._starts.offsets,
+            used=self._starts.used,
+            position_sd=task.start_position_sd_m,
+            heading_sd=task.start_heading_sd_rad,
+            every=np.ones(n, np.bool_),
+            measured=np.zeros((n, 2, 3)),
+            before=np.zeros((n, 2, 3)),
+            paid=np.zeros((len(REWARD_TERMS) + 1, n)),
+            ended=np.zeros((2, n), np.bool_),
+            time=np.zeros(n),
+            references=np.zeros((n, 2, 3)),
+            poses=np.zeros((n, POSE_SIZE * n_epm)),
+            r_max=system.r_max_m,
+            carried=self.settings.frame == "robots",
+            bounds=bounds,
+            action=np.zeros((1, self.actions.size)),
+            observation=np.zeros((1, self.layout.size), np.float32),
         )
-        self._kernel = step_kernel(settings.n_epm, w.width)
-        self._stepped = (
-            w.robots,
-            w.epms,
-            self._targets,
-            *w.held,
-            self._paid,
-            self._ended,
-            self._every,
-            self._measured,
-            self._before,
-            self.system.r_max_m,
-            settings.frame == "robots",
-            bounds,
-            self._time_s,
-            self._references,
-            self._poses,
-        )
-        self._started = (
-            starts.offsets,
-            starts.used,
-            task.start_position_sd_m,
-            task.start_heading_sd_rad,
-            self.actions.home_epms,
-            task.tracking_distance_m,
-            w.robots,
-            w.measurements.numbers,
-            self._projected,
-            *self._told,
-        )
+
+    def _prepare(self) -> None:
+        self.packed = packed(self.state)
+        self._kernel = step_kernel(self.settings.action, self.settings.n_epm, self.world.width)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy takes over: all but what refers to this one's own arrays."""
+        return {name: value for name, value in vars(self).items() if name not in ("packed", "_kernel")}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept)
+        self._prepare()
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Draw the episodes of ``row`` from ``rng`` from now on."""
         self._starts.seed(row, rng)
+
+    def draw(self, mask: Bools) -> None:
+        """Draw the next episode of each row where ``mask`` says, from the row's generator."""
+        self._starts.draw(mask, self.world.coefficients, self.world.duration_s)
 
     def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.
@@ -181,14 +171,14 @@ class Episodes:
         Returns ``observations`` (n, d), without it a new array, with the first ones of these rows written into it.
         """
         observations = np.empty(self._shape, np.float32) if observations is None else observations
-        self._starts.draw(mask, self.world.coefficients, self.world.duration_s)
-        self._workers.run(begin_episodes, len(mask), mask, *self._started, observations)
+        self.draw(mask)
+        self._workers.run(begin_episodes, len(mask), mask, self.packed, observations)
         return observations
 
     def observe(self) -> Observations:
         """Return the observations (n, d), newly allocated."""
         observations = np.empty(self._shape, np.float32)
-        self._workers.run(tell_rows, len(observations), self._every, *self._told, observations)
+        self._workers.run(tell_rows, len(observations), self.state.every, self.packed, observations)
         return observations
 
     def step(self, actions: Floats, active: Bools) -> Observations:
@@ -196,45 +186,27 @@ class Episodes:
 
         Returns the observations (n, d) of all rows, newly allocated; ``outcome`` and ``step_info`` tell the rest.
         """
-        w = self.world
-        self.actions.command(actions, self._measured, w.epms, active, self._targets, self._projected)
         observations = np.empty(self._shape, np.float32)
-        self._workers.run(self._kernel, len(active), active, *self._stepped, observations)
+        self._workers.run(self._kernel, len(active), active, actions, self.packed, observations)
         return observations
 
     def outcome(self) -> tuple[Floats, Bools, Bools]:
         """Return reward, terminated and truncated (n,) of the last step, newly allocated."""
-        return self._paid[-1].copy(), self._ended[0].copy(), self._ended[1].copy()
+        s = self.state
+        return s.paid[-1].copy(), s.ended[0].copy(), s.ended[1].copy()
 
     def state_info(self) -> dict[str, NDArray[Any]]:
         """Return the true state for records and pictures, arrays of length n, newly allocated."""
+        s = self.state
         return {
-            "time_s": self._time_s.copy(),
-            "robots": self.world.robots.copy(),
-            "reference": self._references.copy(),
-            "epm_pose": self._poses.copy(),
+            "time_s": s.time.copy(),
+            "robots": s.robots.copy(),
+            "reference": s.references.copy(),
+            "epm_pose": s.poses.copy(),
         }
 
     def step_info(self) -> dict[str, NDArray[Any]]:
         """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated."""
-        m = self.world.measurements
-        values = (*m.numbers.copy(), *m.counts.copy(), *self._paid[:-1].copy(), self._projected.copy())
+        s = self.state
+        values = (*s.numbers.copy(), *s.counts.copy(), *s.paid[:-1].copy(), s.projected.copy())
         return dict(zip(_STEP_KEYS, values, strict=True))
-
-    def single_state(self) -> dict[str, Any]:
-        """Return ``state_info`` of a single episode, its numbers as Python's."""
-        return {
-            "time_s": self._time_s.item(),
-            "robots": self.world.robots[0].copy(),
-            "reference": self._references[0].copy(),
-            "epm_pose": self._poses[0].copy(),
-        }
-
-    def single_outcome(self) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Return ``outcome`` of a single episode, and ``single_state`` with ``step_info``, its numbers as Python's."""
-        m, info = self.world.measurements, self.single_state()
-        *terms, reward = self._paid.ravel().tolist()
-        terminated, truncated = self._ended.ravel().tolist()
-        values = m.numbers.ravel().tolist() + m.counts.ravel().tolist() + terms + self._projected.tolist()
-        info.update(zip(_STEP_KEYS, values, strict=True))
-        return reward, terminated, truncated, info

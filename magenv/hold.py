@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,51 +234,7 @@ def hold_kernel(n_epm: int, width: int) -> Callable[..., None]:
     """Return ``hold_rows`` for a number of EPMs and of lanes."""
     magnets, side_by_side = (0,) * n_epm, (0,) * width
 
-    def hold(
-        first: int,
-        last: int,
-        active: Bools,
-        robots: Floats,
-        epms: Floats,
-        targets: Floats,
-        constants: Floats,
-        mass: Floats,
-        epm_moment: Floats,
-        coefficients: Floats,
-        duration: Floats,
-        step: NDArray[np.int64],
-        numbers: Floats,
-        counts: NDArray[np.int64],
-        period: float,
-        substeps: int,
-        loss_distance: float,
-        tracking_distance: float,
-        diameter: float,
-        wall_radius: float,
-    ) -> None:
-        hold_rows(
-            first,
-            last,
-            active,
-            robots,
-            epms,
-            targets,
-            constants,
-            mass,
-            epm_moment,
-            coefficients,
-            duration,
-            step,
-            numbers,
-            counts,
-            period,
-            substeps,
-            loss_distance,
-            tracking_distance,
-            diameter,
-            wall_radius,
-            magnets,
-            side_by_side,
-        )
+    def hold(*arguments: Any) -> None:
+        hold_rows(*arguments, magnets, side_by_side)  # type: ignore[call-arg]
 
     return kernel(hold)

@@ -6,149 +6,146 @@ A call of a kernel from Python costs as much as a short hold, so the laws of the
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.actions import ActionMode, pose_rows, step_rows, wrench_rows
 from magenv.hold import hold_rows
-from magenv.home import start_rows
+from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel
 from magenv.starts import place_rows
+from magenv.state import State
 from magenv.task import observe_rows, reward_terms
 from magenv.trajectories import trajectory_of
 from magenv.world import begin_rows, describe_rows, time_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Observations = NDArray[np.float32]
+Step = Callable[[int, int, Bools, Floats, State, Observations], None]
 
 
 @kernel
-def tell_rows(
-    first: int,
-    last: int,
-    mask: Bools,
-    measured: Floats,
-    before: Floats,
-    coefficients: Floats,
-    duration: Floats,
-    step: Integers,
-    counts: Integers,
-    epms: Floats,
-    period: float,
-    substeps: int,
-    r_max: float,
-    carried: bool,
-    bounds: Observations,
-    time: Floats,
-    references: Floats,
-    poses: Floats,
-    observations: Observations,
-) -> None:
-    """Write what is told of the rows where ``mask`` says: to the controller and, the last but one, to records."""
+def clip(numbers: Floats) -> bool:
+    """Clip ``numbers`` (k,) to [-1, 1] in place; return whether all were finite."""
+    unfit = 0
+    for i in range(len(numbers)):
+        unfit += 0 if abs(numbers[i]) < math.inf else 1
+        numbers[i] = min(max(numbers[i], -1.0), 1.0)
+    return unfit == 0
+
+
+@kernel
+def _home(first: int, last: int, active: Bools, actions: Floats, s: State) -> None:
+    home_rows(first, last, active, actions, s.measured, s.home, s.limits, s.targets, s.projected)
+
+
+@kernel
+def _pose(first: int, last: int, active: Bools, actions: Floats, s: State) -> None:
+    pose_rows(first, last, active, actions, s.low, s.high, s.limits, s.targets, s.projected)
+
+
+@kernel
+def _step(first: int, last: int, active: Bools, actions: Floats, s: State) -> None:
+    step_rows(first, last, active, actions, s.epms, s.limits, s.targets, s.projected)
+
+
+@kernel
+def _wrench(first: int, last: int, active: Bools, actions: Floats, s: State) -> None:
+    wrench_rows(
+        first,
+        last,
+        active,
+        actions,
+        s.measured,
+        s.epms,
+        s.wrench_starts,
+        s.ipm_moment,
+        s.nominal_epm_moment,
+        s.wrench_scale,
+        s.limits,
+        s.targets,
+        s.projected,
+    )
+
+
+@kernel
+def tell_rows(first: int, last: int, mask: Bools, s: State, observations: Observations) -> None:
+    """Write what is told of the rows where ``mask`` says: to records, and to the controller in ``observations``."""
     describe_rows(
-        first, last, mask, coefficients, duration, step, counts, period, substeps, epms, time, references, poses
+        first,
+        last,
+        mask,
+        s.coefficients,
+        s.duration,
+        s.step,
+        s.counts,
+        s.period,
+        s.substeps,
+        s.epms,
+        s.time,
+        s.references,
+        s.poses,
     )
     observe_rows(
         first,
         last,
         mask,
-        measured,
-        before,
-        coefficients,
-        duration,
-        step,
-        epms,
-        period,
-        r_max,
-        carried,
-        bounds,
+        s.measured,
+        s.before,
+        s.coefficients,
+        s.duration,
+        s.step,
+        s.epms,
+        s.period,
+        s.r_max,
+        s.carried,
+        s.bounds,
         observations,
     )
 
 
 @kernel
-def begin_episodes(
-    first: int,
-    last: int,
-    mask: Bools,
-    offsets: Floats,
-    used: Integers,
-    position_sd: float,
-    heading_sd: float,
-    home: Floats,
-    tracking_distance: float,
-    robots: Floats,
-    numbers: Floats,
-    projected: Bools,
-    measured: Floats,
-    before: Floats,
-    coefficients: Floats,
-    duration: Floats,
-    step: Integers,
-    counts: Integers,
-    epms: Floats,
-    period: float,
-    substeps: int,
-    r_max: float,
-    carried: bool,
-    bounds: Observations,
-    time: Floats,
-    references: Floats,
-    poses: Floats,
-    observations: Observations,
-) -> None:
+def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: Observations) -> None:
     """Begin episodes where ``mask`` says, by their next offsets, EPMs at home; then tell of these rows."""
     place_rows(
-        first, last, mask, offsets, used, position_sd, heading_sd, coefficients, duration, robots, measured, before
-    )
-    start_rows(first, last, mask, measured, home, epms)
-    begin_rows(first, last, mask, robots, coefficients, duration, tracking_distance, step, numbers, counts)
-    for i in range(first, last):
-        projected[i] &= not mask[i]
-    tell_rows(
         first,
         last,
         mask,
-        measured,
-        before,
-        coefficients,
-        duration,
-        step,
-        counts,
-        epms,
-        period,
-        substeps,
-        r_max,
-        carried,
-        bounds,
-        time,
-        references,
-        poses,
-        observations,
+        s.offsets,
+        s.used,
+        s.position_sd,
+        s.heading_sd,
+        s.coefficients,
+        s.duration,
+        s.robots,
+        s.measured,
+        s.before,
     )
+    start_rows(first, last, mask, s.measured, s.home_epms, s.epms)
+    begin_rows(
+        first, last, mask, s.robots, s.coefficients, s.duration, s.tracking_distance, s.step, s.numbers, s.counts
+    )
+    projected = s.projected
+    for i in range(first, last):
+        projected[i] &= not mask[i]
+    tell_rows(first, last, mask, s, observations)
 
 
 @kernel
-def _settle_rows(
-    first: int,
-    last: int,
-    active: Bools,
-    robots: Floats,
-    numbers: Floats,
-    counts: Integers,
-    step: Integers,
-    duration: Floats,
-    period: float,
-    substeps: int,
-    measured: Floats,
-    before: Floats,
-    paid: Floats,
-    ended: Bools,
-) -> None:
+def begin_one(s: State) -> None:
+    """Begin the only episode."""
+    begin_episodes(0, 1, s.every, s, s.observation)
+
+
+@kernel
+def _settle_rows(first: int, last: int, active: Bools, s: State) -> None:
     """Measure the robots after a hold; write what it paid and how it ended. Inactive rows: nothing, not ended."""
+    robots, measured, before, numbers, counts = s.robots, s.measured, s.before, s.numbers, s.counts
+    paid, ended, step, duration = s.paid, s.ended, s.step, s.duration
     for i in range(first, last):
         paid[2, i], ended[0, i], ended[1, i] = 0.0, False, False
         if active[i]:
@@ -159,110 +156,109 @@ def _settle_rows(
             paid[0, i], paid[1, i] = reward_terms(numbers[0, i], numbers[1, i])
             paid[2, i] = 0.5 * (paid[0, i] + paid[1, i])
             ended[0, i] = counts[1, i] > 0
-            now = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
-            over = now >= duration[trajectory_of(i, len(duration))] - 1e-9 * period
+            now = time_of(step[i], counts[0, i], counts[1, i], s.period, s.substeps)
+            over = now >= duration[trajectory_of(i, len(duration))] - 1e-9 * s.period
             ended[1, i] = over and not ended[0, i]
 
 
+@kernel
+def _hold(
+    first: int,
+    last: int,
+    active: Bools,
+    s: State,
+    observations: Observations,
+    magnets: tuple[int, ...],
+    side_by_side: tuple[int, ...],
+) -> None:
+    """Hold the commanded EPMs for one control period; what that paid, and what is told of all rows."""
+    hold_rows(
+        first,
+        last,
+        active,
+        s.robots,
+        s.epms,
+        s.targets,
+        s.constants,
+        s.mass,
+        s.epm_moment,
+        s.coefficients,
+        s.duration,
+        s.step,
+        s.numbers,
+        s.counts,
+        s.period,
+        s.substeps,
+        s.loss_distance,
+        s.tracking_distance,
+        s.diameter,
+        s.wall_radius,
+        magnets,
+        side_by_side,
+    )
+    _settle_rows(first, last, active, s)
+    tell_rows(first, last, s.every, s, observations)
+
+
 @functools.cache
-def step_kernel(n_epm: int, width: int) -> Callable[..., None]:
-    """Return the kernel that steps episodes: the hold of ``hold_rows``, what it paid, what is told of all rows."""
+def step_kernel(mode: ActionMode, n_epm: int, width: int) -> Step:
+    """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
+
+    Mode, number of EPMs and of lanes are constants of the machine code: of the branches one is compiled.
+    """
     magnets, side_by_side = (0,) * n_epm, (0,) * width
 
-    def step_rows(
-        first: int,
-        last: int,
-        active: Bools,
-        robots: Floats,
-        epms: Floats,
-        targets: Floats,
-        constants: Floats,
-        mass: Floats,
-        epm_moment: Floats,
-        coefficients: Floats,
-        duration: Floats,
-        step: Integers,
-        numbers: Floats,
-        counts: Integers,
-        period: float,
-        substeps: int,
-        loss_distance: float,
-        tracking_distance: float,
-        diameter: float,
-        wall_radius: float,
-        paid: Floats,
-        ended: Bools,
-        every: Bools,
-        measured: Floats,
-        before: Floats,
-        r_max: float,
-        carried: bool,
-        bounds: Observations,
-        time: Floats,
-        references: Floats,
-        poses: Floats,
-        observations: Observations,
+    def step_episodes(
+        first: int, last: int, active: Bools, actions: Floats, s: State, observations: Observations
     ) -> None:
-        hold_rows(
-            first,
-            last,
-            active,
-            robots,
-            epms,
-            targets,
-            constants,
-            mass,
-            epm_moment,
-            coefficients,
-            duration,
-            step,
-            numbers,
-            counts,
-            period,
-            substeps,
-            loss_distance,
-            tracking_distance,
-            diameter,
-            wall_radius,
-            magnets,
-            side_by_side,
-        )
-        _settle_rows(
-            first,
-            last,
-            active,
-            robots,
-            numbers,
-            counts,
-            step,
-            duration,
-            period,
-            substeps,
-            measured,
-            before,
-            paid,
-            ended,
-        )
-        tell_rows(
-            first,
-            last,
-            every,
-            measured,
-            before,
-            coefficients,
-            duration,
-            step,
-            counts,
-            epms,
-            period,
-            substeps,
-            r_max,
-            carried,
-            bounds,
-            time,
-            references,
-            poses,
-            observations,
+        if mode == "home":
+            _home(first, last, active, actions, s)
+        elif mode == "pose":
+            _pose(first, last, active, actions, s)
+        elif mode == "step":
+            _step(first, last, active, actions, s)
+        else:
+            _wrench(first, last, active, actions, s)
+        _hold(first, last, active, s, observations, magnets, side_by_side)
+
+    return kernel(step_episodes)
+
+
+@functools.cache
+def one_kernel(mode: ActionMode, n_epm: int) -> Callable[[State], tuple[object, ...]]:
+    """Return the kernel that steps the only episode by ``action``, clipped; one that is not finite moves nothing."""
+    magnets, side_by_side = (0,) * n_epm, (0,)
+
+    def step_one(s: State) -> tuple[object, ...]:
+        fit = clip(s.action[0])
+        if fit:
+            if mode == "home":
+                _home(0, 1, s.every, s.action, s)
+            elif mode == "pose":
+                _pose(0, 1, s.every, s.action, s)
+            elif mode == "step":
+                _step(0, 1, s.every, s.action, s)
+            else:
+                _wrench(0, 1, s.every, s.action, s)
+            _hold(0, 1, s.every, s, s.observation, magnets, side_by_side)
+        paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
+        return (
+            fit,
+            paid[2, 0],
+            ended[0, 0],
+            ended[1, 0],
+            s.time[0],
+            numbers[0, 0],
+            numbers[1, 0],
+            numbers[2, 0],
+            numbers[3, 0],
+            numbers[4, 0],
+            numbers[5, 0],
+            counts[0, 0],
+            counts[1, 0],
+            paid[0, 0],
+            paid[1, 0],
+            s.projected[0],
         )
 
-    return kernel(step_rows)
+    return kernel(step_one)

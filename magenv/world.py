@@ -163,6 +163,8 @@ class World:
         Control periods since the start.
     coefficients, duration_s : ndarray, shape (n or 1, 2, 32, 3, 4) and (n or 1,)
         The trajectories; one where all rows follow the same.
+    constants : ndarray, shape (n, 10)
+        Of a substep, see ``magenv.dynamics.constants``.
     width : int
         Lanes of the hold.
     held : tuple
@@ -195,11 +197,10 @@ class World:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
         self.step_count: Integers = np.zeros(n, np.int64)
         self.measurements = Measurements(n)
-        per_substep: Floats = np.empty((n, CONSTANTS_SIZE))
-        constants(self.physics, task.period_s / self.substeps, per_substep)
-        # Collected once: the arrays are the same ones at every step, and looking them up costs as much as a short hold.
+        self.constants: Floats = np.empty((n, CONSTANTS_SIZE))
+        constants(self.physics, task.period_s / self.substeps, self.constants)
         self.held = (
-            per_substep,
+            self.constants,
             self.physics.mass,
             self.physics.epm_moment,
             self.coefficients,

@@ -157,6 +157,12 @@ def test_caller_cannot_reach_into_the_env(make_env: MakeEnv) -> None:
 # Commands
 
 
+def test_render_before_reset_is_told() -> None:
+    env = gymnasium.make(magenv.ENV_ID, render_mode="rgb_array")
+    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+        env.render()
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_actions_beyond_the_box_are_clipped(make_env: MakeEnv, mode: ActionMode) -> None:
     results = []

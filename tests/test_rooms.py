@@ -17,6 +17,7 @@ PACKAGE = Path(magenv.__file__).parent
 ORDER = [
     "params",
     "kernels",
+    "state",
     "angles",
     "workers",
     "dipole",
@@ -42,6 +43,7 @@ ORDER = [
     "starts",
     "steps",
     "episodes",
+    "episode",
     "scene",
     "canvas",
     "render",

@@ -116,7 +116,7 @@ def test_rate_is_the_shortest_turn(turn: float) -> None:
     episodes = Episodes(1, Settings(frame="global"))
     episodes.seed(0, np.random.default_rng(0))
     episodes.start(np.ones(1, np.bool_))
-    episodes._measured[0, 1, 2] = episodes._before[0, 1, 2] + turn
+    episodes.state.measured[0, 1, 2] = episodes.state.before[0, 1, 2] + turn
     rate = unpack(episodes.observe()[0], episodes.layout).rates[1, 2]
     assert rate == pytest.approx(math.remainder(turn, 2 * math.pi) / 0.5, rel=1e-6)
 
@@ -126,7 +126,7 @@ def turned_scene(episodes: Episodes, angle: float) -> None:
     c, s = math.cos(angle), math.sin(angle)
     q = np.array([[c, -s], [s, c]])
     world = episodes.world
-    for poses in (episodes._measured, episodes._before, world.robots):
+    for poses in (episodes.state.measured, episodes.state.before, world.robots):
         poses[..., :2] = poses[..., :2] @ q.T
         poses[..., 2] += angle
     world.robots[..., 3:5] = world.robots[..., 3:5] @ q.T

@@ -1,0 +1,154 @@
+"""All that the kernels of a step know of many episodes, in one argument.
+
+A kernel that is called from Python unpacks each argument anew; thirty arrays cost as much as a short hold. Here they
+are unpacked once. The arrays stay numpy's: whoever holds them sees what the kernels write.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numba import types
+from numba.experimental import structref
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from magenv.kernels import kernel
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+Observations = NDArray[np.float32]
+
+
+class State(NamedTuple):
+    """``n`` episodes: what changes, what is told, and the parameters; see ``World`` and ``Episodes`` for the former."""
+
+    robots: Floats
+    """(n, 2, 6)"""
+    epms: Floats
+    """(n, N, 6)"""
+    constants: Floats
+    """(n, 10) of a substep, see ``dynamics.constants``."""
+    mass: Floats
+    """(n, 2) kg"""
+    epm_moment: Floats
+    """(n,) A m^2"""
+    coefficients: Floats
+    """(n or 1, 2, 32, 3, 4)"""
+    duration: Floats
+    """(n or 1,) s"""
+    step: Integers
+    """(n,) control periods since the start."""
+    numbers: Floats
+    """(6, n) rows named by ``Measurements.NUMBERS``."""
+    counts: Integers
+    """(2, n) rows named by ``Measurements.COUNTS``."""
+    period: float
+    substeps: int
+    loss_distance: float
+    tracking_distance: float
+    diameter: float
+    wall_radius: float
+
+    targets: Floats
+    """(n, N, 6) commanded EPMs."""
+    projected: Bools
+    """(n,) whether the least gap made them differ from the action."""
+    home: Floats
+    """(5 N,) pose at home."""
+    low: Floats
+    """(5 N,) bounds of poses."""
+    high: Floats
+    limits: Floats
+    """(3,) least and greatest radius, least gap, m."""
+    wrench_starts: Floats
+    """(k, 5 N) starts of the allocation."""
+    wrench_scale: Floats
+    """(10,)"""
+    ipm_moment: float
+    nominal_epm_moment: float
+
+    offsets: Floats
+    """(n, k, 6) starts drawn ahead."""
+    used: Integers
+    """(n,) so many of them are used."""
+    position_sd: float
+    heading_sd: float
+    home_epms: Floats
+    """(N, 6) in the robots' frame."""
+
+    every: Bools
+    """(n,) all true."""
+    measured: Floats
+    """(n, 2, 3) poses of the robots at this control instant."""
+    before: Floats
+    """(n, 2, 3) and at the one before."""
+    paid: Floats
+    """(3, n) reward terms, then the reward."""
+    ended: Bools
+    """(2, n) terminated, truncated."""
+    time: Floats
+    """(n,) s"""
+    references: Floats
+    """(n, 2, 3) at that time."""
+    poses: Floats
+    """(n, 5 N) of the EPMs."""
+    r_max: float
+    carried: bool
+    bounds: Observations
+    """(d,) of an observation."""
+    action: Floats
+    """(1, size) of a single episode, taken by ``step_one``."""
+    observation: Observations
+    """(1, d) of a single episode."""
+
+
+@structref.register
+class _PackedType(types.StructRef):
+    """Numba's type of a packed state."""
+
+
+class _Packed(structref.StructRefProxy):
+    """A packed state, as Python sees it."""
+
+    arrays: State
+
+
+structref.define_proxy(_Packed, _PackedType, State._fields)  # type: ignore[no-untyped-call]
+
+
+@intrinsic
+def _uncounted(_: Any, state: Any) -> Any:
+    """Return the tuple, its arrays without owners: counting references to them took a fifth of a short step."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        parts = []
+        for i, kind in enumerate(state):
+            part = builder.extract_value(arguments[0], i)
+            if isinstance(kind, types.Array):
+                array = context.make_array(kind)(context, builder, part)
+                array.meminfo = array.meminfo.type(None)
+                part = array._getvalue()
+            parts.append(part)
+        return context.make_tuple(builder, state, parts)
+
+    return state(state), generate
+
+
+@kernel
+def _pack(state: State) -> _Packed:
+    return _Packed(*_uncounted(state))  # type: ignore[no-untyped-call, call-arg]
+
+
+def packed(state: State) -> State:
+    """Return the state as one argument of kernels, in which its parts have the same names; nothing is copied."""
+    one = _pack(state)
+    one.arrays = state  # which kernels see without owning them live as long as what they see them by
+    return cast("State", one)
+
+
+def type_of(state: State) -> Any:
+    """Return numba's type of a packed state, to compile a kernel for it beforehand."""
+    return cast("_Packed", state)._numba_type_
