@@ -20,10 +20,17 @@ from magenv.home import home_epms, home_rows, start_rows
 from magenv.kernels import kernel
 from magenv.params import System, require
 from magenv.poses import (
+    EPM_SIZE,
+    LANES,
+    LANES_SIZE,
     POSE_SIZE,
+    command_lanes,
     epm_to_pose,
     home_pose,
+    keep_gap,
+    place_lanes,
     pose_bounds,
+    pose_lanes,
     pose_to_epm,
     project_epms,
     robots_frame,
@@ -59,16 +66,19 @@ def pose_rows(
     projected: Bools,
 ) -> None:
     """Write the EPMs (n, N, 6) at absolute poses: ``actions`` (n, 5 N) from ``low`` to ``high``."""
-    pose = np.empty(POSE_SIZE)
-    for i in range(first, last):
-        if not active[i]:
-            continue
+    lanes = np.zeros((LANES_SIZE, LANES))
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
         for k in range(targets.shape[1]):
             for j in range(POSE_SIZE):
                 at = POSE_SIZE * k + j
-                pose[j] = low[at] + 0.5 * (actions[i, at] + 1.0) * (high[at] - low[at])
-            pose_to_epm(pose, targets[i, k])
-        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+                for i in range(count):
+                    lanes[j, i] = low[at] + 0.5 * (actions[start + i, at] + 1.0) * (high[at] - low[at])
+            place_lanes(lanes)
+            command_lanes(lanes, start, count, k, active, targets)
+        for i in range(start, start + count):
+            if active[i]:
+                projected[i] = keep_gap(targets, i, limits)
 
 
 @kernel
@@ -83,17 +93,24 @@ def step_rows(
     projected: Bools,
 ) -> None:
     """Write the EPMs (n, N, 6) whose poses differ by ``actions`` (n, 5 N) from those of ``epms``."""
-    pose = np.empty(POSE_SIZE)
-    for i in range(first, last):
-        if not active[i]:
-            continue
+    lanes = np.zeros((LANES_SIZE, LANES))
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
         for k in range(targets.shape[1]):
-            epm_to_pose(epms[i, k], pose)
-            for j in range(POSE_SIZE):
-                pose[j] += actions[i, POSE_SIZE * k + j] * (STEP_RADIUS_M if j == 2 else STEP_ANGLE_RAD)
-            pose[2] = min(max(pose[2], limits[0]), limits[1])
-            pose_to_epm(pose, targets[i, k])
-        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+            for i in range(count):
+                for j in range(EPM_SIZE):
+                    lanes[POSE_SIZE + j, i] = epms[start + i, k, j]
+            pose_lanes(lanes)
+            for i in range(count):
+                for j in range(POSE_SIZE):
+                    most = STEP_RADIUS_M if j == 2 else STEP_ANGLE_RAD
+                    lanes[j, i] += actions[start + i, POSE_SIZE * k + j] * most
+                lanes[2, i] = min(max(lanes[2, i], limits[0]), limits[1])
+            place_lanes(lanes)
+            command_lanes(lanes, start, count, k, active, targets)
+        for i in range(start, start + count):
+            if active[i]:
+                projected[i] = keep_gap(targets, i, limits)
 
 
 @kernel

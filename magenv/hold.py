@@ -57,11 +57,11 @@ _DEVIATION, _TOUCH, _WALL = 1, 2, 3
 
 @law
 def _load_segment(lanes: Floats, i: int, position: float, coefficients: Floats) -> None:
-    """Put the coefficients (2, 32, 3, 4) of the segment at ``position`` into lane ``i``."""
+    """Put the coefficients (32, 2, 3, 4) of the segment at ``position`` into lane ``i``."""
     segment = min(int(position), SEGMENTS - 1) if position >= 0.0 else 0
     lanes[SEGMENT, i] = segment
     for j in range(24):
-        lanes[COEFFICIENTS + j, i] = coefficients[j // 12, segment, (j // 4) % 3, j % 4]
+        lanes[COEFFICIENTS + j, i] = coefficients[segment, j // 12, (j // 4) % 3, j % 4]
 
 
 @law

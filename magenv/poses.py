@@ -11,17 +11,22 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.angles import arctan2, arctan2_all, sincos
+from magenv.angles import arctan2, sincos
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Pair = tuple[float, float]
 
 POSE_SIZE = 5
 """Numbers per EPM in a pose vector."""
 EPM_SIZE = 6
 """Numbers per EPM in Cartesian form: centre, unit moment."""
-_BLOCK = 64
+LANES = 8
+"""EPMs computed side by side: a lane holds its pose in rows 0 to 4 and its centre and moment in rows 5 to 10. All stand
+in one array (rows, lanes), so that LLVM sees that they do not overlap and vectorises what is done to each lane."""
+LANES_SIZE = POSE_SIZE + EPM_SIZE
 _STUCK_TURNS = 100
 GAP_TOLERANCE_M = 1e-9
 """Within this the least gap and the radius limits hold after ``project``."""
@@ -35,43 +40,54 @@ SECOND_ROBOT_WEIGHT = 0.8
 
 
 @law
-def place_epm(
-    radius: float, sa: float, ca: float, se: float, ce: float, sb: float, cb: float, sf: float, cf: float, epm: Floats
-) -> None:
-    """Write centre and unit moment into ``epm`` (6,).
+def _placed(radius: float, a: Pair, e: Pair, b: Pair, f: Pair) -> tuple[float, float, float, float, float, float]:
+    """Return centre and unit moment.
 
-    Radius in m; sine and cosine of the centre's azimuth a and elevation e and of the moment's, b and f.
+    Radius in m; (sine, cosine) of the centre's azimuth a and elevation e and of the moment's, b and f.
     """
-    epm[0], epm[1], epm[2] = radius * ce * ca, radius * ce * sa, radius * se
-    epm[3], epm[4], epm[5] = cf * cb, cf * sb, sf
+    (sa, ca), (se, ce), (sb, cb), (sf, cf) = a, e, b, f
+    return radius * ce * ca, radius * ce * sa, radius * se, cf * cb, cf * sb, sf
+
+
+@law
+def place_lanes(lanes: Floats) -> None:
+    """Write the EPMs of the poses in ``lanes`` (11, lanes)."""
+    for i in range(LANES):
+        lanes[5, i], lanes[6, i], lanes[7, i], lanes[8, i], lanes[9, i], lanes[10, i] = _placed(
+            lanes[2, i], sincos(lanes[0, i]), sincos(lanes[1, i]), sincos(lanes[3, i]), sincos(lanes[4, i])
+        )
+
+
+@law
+def _pose_of(x: float, y: float, z: float, mx: float, my: float, mz: float) -> tuple[float, float, float, float, float]:
+    """Return the pose of a centre and a moment, azimuths in [-pi, pi], elevations in [-pi/2, pi/2]."""
+    across, moment_across = math.sqrt(x * x + y * y), math.sqrt(mx * mx + my * my)
+    radius = math.sqrt(x * x + y * y + z * z)
+    return arctan2(y, x), arctan2(z, across), radius, arctan2(my, mx), arctan2(mz, moment_across)
+
+
+@law
+def pose_lanes(lanes: Floats) -> None:
+    """Write the poses of the EPMs in ``lanes`` (11, lanes)."""
+    for i in range(LANES):
+        lanes[0, i], lanes[1, i], lanes[2, i], lanes[3, i], lanes[4, i] = _pose_of(
+            lanes[5, i], lanes[6, i], lanes[7, i], lanes[8, i], lanes[9, i], lanes[10, i]
+        )
 
 
 @law
 def pose_to_epm(pose: Floats, epm: Floats) -> None:
     """Write centre and unit moment of one pose (5,) into ``epm`` (6,)."""
     a, e, b, f = pose[0], pose[1], pose[3], pose[4]
-    place_epm(
-        pose[2],
-        math.sin(a),
-        math.cos(a),
-        math.sin(e),
-        math.cos(e),
-        math.sin(b),
-        math.cos(b),
-        math.sin(f),
-        math.cos(f),
-        epm,
-    )
+    centre_angles = (math.sin(a), math.cos(a)), (math.sin(e), math.cos(e))
+    moment_angles = (math.sin(b), math.cos(b)), (math.sin(f), math.cos(f))
+    epm[0], epm[1], epm[2], epm[3], epm[4], epm[5] = _placed(pose[2], *centre_angles, *moment_angles)
 
 
 @kernel
 def epm_to_pose(epm: Floats, pose: Floats) -> None:
-    """Write the pose (5,) of ``epm`` (6,), azimuths in [-pi, pi], elevations in [-pi/2, pi/2]."""
-    pose[0] = arctan2(epm[1], epm[0])
-    pose[1] = arctan2(epm[2], math.sqrt(epm[0] * epm[0] + epm[1] * epm[1]))
-    pose[2] = math.sqrt(epm[0] * epm[0] + epm[1] * epm[1] + epm[2] * epm[2])
-    pose[3] = arctan2(epm[4], epm[3])
-    pose[4] = arctan2(epm[5], math.sqrt(epm[3] * epm[3] + epm[4] * epm[4]))
+    """Write the pose (5,) of ``epm`` (6,)."""
+    pose[0], pose[1], pose[2], pose[3], pose[4] = _pose_of(epm[0], epm[1], epm[2], epm[3], epm[4], epm[5])
 
 
 @kernel
@@ -144,6 +160,27 @@ def project_epms(epms: Floats, r_min: float, r_max: float, gap: float) -> bool:
 
 
 @law
+def command_lanes(lanes: Floats, start: int, count: int, k: int, active: Bools, targets: Floats) -> None:
+    """Write the ``k``-th EPMs of ``count`` rows from ``lanes`` into the active rows of ``targets`` (n, N, 6)."""
+    for i in range(count):
+        if active[start + i]:
+            for j in range(EPM_SIZE):
+                targets[start + i, k, j] = lanes[POSE_SIZE + j, i]
+
+
+@law
+def keep_gap(epms: Floats, row: int, limits: Floats) -> bool:
+    """Project a row of EPMs (n, N, 6), radii within the limits, if centres are too close; return whether they were."""
+    keeps = True
+    for k in range(1, epms.shape[1]):
+        for j in range(k):
+            x, y = epms[row, k, 0] - epms[row, j, 0], epms[row, k, 1] - epms[row, j, 1]
+            z = epms[row, k, 2] - epms[row, j, 2]
+            keeps &= x * x + y * y + z * z >= limits[2] * limits[2]
+    return False if keeps else project_epms(epms[row], limits[0], limits[1], limits[2])
+
+
+@law
 def frame_direction(s1: float, c1: float, s2: float, c2: float) -> tuple[float, float]:
     """Return the direction (cosine, sine) of the frame the robots carry: along h1 + 0.8 h2, of headings (s, c).
 
@@ -194,25 +231,16 @@ def _to_epms(poses: Floats, epms: Floats) -> None:
 @kernel
 def epms_to_poses(epms: Floats, first: int, last: int, poses: Floats) -> None:
     """Write the poses (n, 5) of the EPMs (n, 6) from ``first`` to ``last``, in blocks whose angles are vectorised."""
-    across, along, angles = np.empty(4 * _BLOCK), np.empty(4 * _BLOCK), np.empty(4 * _BLOCK)
-    for start in range(first, last, _BLOCK):
-        end = min(start + _BLOCK, last)
-        for i in range(start, end):
-            e, at = epms[i], 4 * (i - start)
-            across[at], along[at] = e[1], e[0]
-            across[at + 1], along[at + 1] = e[2], math.sqrt(e[0] * e[0] + e[1] * e[1])
-            across[at + 2], along[at + 2] = e[4], e[3]
-            across[at + 3], along[at + 3] = e[5], math.sqrt(e[3] * e[3] + e[4] * e[4])
-        arctan2_all(across, along, 4 * (end - start), angles)
-        for i in range(start, end):
-            at = 4 * (i - start)
-            poses[i, 0], poses[i, 1], poses[i, 3], poses[i, 4] = (
-                angles[at],
-                angles[at + 1],
-                angles[at + 2],
-                angles[at + 3],
-            )
-            poses[i, 2] = math.sqrt(epms[i, 0] * epms[i, 0] + epms[i, 1] * epms[i, 1] + epms[i, 2] * epms[i, 2])
+    lanes = np.zeros((LANES_SIZE, LANES))
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
+        for i in range(count):
+            for j in range(EPM_SIZE):
+                lanes[POSE_SIZE + j, i] = epms[start + i, j]
+        pose_lanes(lanes)
+        for i in range(count):
+            for j in range(POSE_SIZE):
+                poses[start + i, j] = lanes[j, i]
 
 
 def _as_rows(values: ArrayLike, width: int, name: str, must_be: str) -> Floats:

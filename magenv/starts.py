@@ -7,7 +7,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel
-from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_kernel, trajectory_of
+from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_of, trajectory_of
 from magenv.workers import Workers
 
 Floats = NDArray[np.float64]
@@ -36,13 +36,13 @@ def place_rows(
     for i in range(first, last):
         if mask[i]:
             which = trajectory_of(i, len(duration))
-            reference_kernel(coefficients[which], duration[which], 0.0, measured[i])
-            offset = offsets[i, used[i]]
+            reference_of(coefficients, which, duration[which], 0.0, measured, i)
+            at = used[i]
             used[i] += 1
             for robot in range(2):
-                measured[i, robot, 0] += position_sd * offset[2 * robot]
-                measured[i, robot, 1] += position_sd * offset[2 * robot + 1]
-                measured[i, robot, 2] += heading_sd * offset[4 + robot]
+                measured[i, robot, 0] += position_sd * offsets[i, at, 2 * robot]
+                measured[i, robot, 1] += position_sd * offsets[i, at, 2 * robot + 1]
+                measured[i, robot, 2] += heading_sd * offsets[i, at, 4 + robot]
                 for j in range(3):
                     robots[i, robot, j], robots[i, robot, 3 + j] = measured[i, robot, j], 0.0
                     before[i, robot, j] = measured[i, robot, j]

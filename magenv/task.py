@@ -30,7 +30,7 @@ from magenv.angles import sincos_all, wrap
 from magenv.kernels import kernel, law
 from magenv.params import System, require
 from magenv.poses import frame_direction
-from magenv.trajectories import reference_kernel, trajectory_of
+from magenv.trajectories import reference_of, trajectory_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -44,10 +44,10 @@ LENGTH_SCALE_M = 0.1
 SPEED_SCALE_MPS = 0.01
 PREVIEW_SCALE_M = 0.01
 
-_BLOCK = 64  # rows whose angles are vectorised together
+_PER_ERROR, _PER_LENGTH, _PER_PREVIEW = 1.0 / ERROR_SCALE_M, 1.0 / LENGTH_SCALE_M, 1.0 / PREVIEW_SCALE_M
+_BLOCK = 16  # rows told together
 _ROBOTS, _RATES, _SEPARATION, _FRAME, _PREVIEW, _EPMS = 8, 16, 22, 23, 25, 49
-_EPM_SIZE = 7
-_ERRORS_SIZE = 8
+_EPM_SIZE, _ERRORS_SIZE = 7, 8
 
 POSITION_SCALES_M = (0.002, 0.006, 0.020)
 HEADING_SCALES_RAD = (0.04, 0.15, 0.5)
@@ -113,52 +113,79 @@ def _turn(x: float, y: float, c: float, s: float) -> tuple[float, float]:
 
 
 @law
+def _preview(
+    coefficients: Floats,
+    which: int,
+    duration: float,
+    now: int,
+    period: float,
+    references: Floats,
+    previews: Floats,
+    at: int,
+) -> None:
+    """Write the references at the ends of the coming holds from row ``at`` on, and what the later ones add, scaled."""
+    for k in range(PREVIEW):
+        reference_of(coefficients, which, duration, (now + 1 + k) * period, references, at + k)
+    for k in range(1, PREVIEW):
+        for robot in range(2):
+            for axis in range(3):
+                ahead = references[at + k, robot, axis] - references[at, robot, axis]
+                previews[at + k, robot, axis] = wrap(ahead) if axis == 2 else ahead * _PER_PREVIEW
+
+
+@law
 def _observe(
+    i: int,
     measured: Floats,
     before: Floats,
+    target: int,
     references: Floats,
+    previews: Floats,
     epms: Floats,
     period: float,
     r_max: float,
     carried: bool,
-    sines: Floats,
-    cosines: Floats,
+    turns: Floats,
     full: Floats,
+    row: int,
 ) -> None:
-    """Write all parts of one observation into ``full``.
+    """Write all parts of the observation of row ``i`` into a row of ``full``.
 
-    ``references`` (5, 2, 3); sines and cosines (4,) of both headings and of both heading errors.
+    Its references and previews (5, 2, 3) stand from ``target`` on; ``turns`` (3, 4 k) holds, four a row, both headings
+    and both heading errors, their sines and their cosines.
     """
-    frame_c, frame_s = frame_direction(sines[0], cosines[0], sines[1], cosines[1])
+    sines, cosines, angle = turns[1], turns[2], 4 * row
+    frame_c, frame_s = frame_direction(sines[angle], cosines[angle], sines[angle + 1], cosines[angle + 1])
     c, s = (frame_c, frame_s) if carried else (1.0, 0.0)
+    per_period, per_speed = 1.0 / period, 1.0 / (period * SPEED_SCALE_MPS)
     for robot in range(2):
         error, pose, rate = 4 * robot, _ROBOTS + 4 * robot, _RATES + 3 * robot
-        x, y, heading = measured[robot, 0], measured[robot, 1], measured[robot, 2]
-        target_x, target_y, target_heading = references[0, robot, 0], references[0, robot, 1], references[0, robot, 2]
-        along, across = _turn(target_x - x, target_y - y, c, s)
-        full[error], full[error + 1] = along / ERROR_SCALE_M, across / ERROR_SCALE_M
-        full[error + 2], full[error + 3] = sines[2 + robot], cosines[2 + robot]
+        x, y, heading = measured[i, robot, 0], measured[i, robot, 1], measured[i, robot, 2]
+        along, across = _turn(references[target, robot, 0] - x, references[target, robot, 1] - y, c, s)
+        full[row, error], full[row, error + 1] = along * _PER_ERROR, across * _PER_ERROR
+        full[row, error + 2], full[row, error + 3] = sines[angle + 2 + robot], cosines[angle + 2 + robot]
         along, across = _turn(x, y, c, s)
-        full[pose], full[pose + 1] = along / LENGTH_SCALE_M, across / LENGTH_SCALE_M
-        full[pose + 3], full[pose + 2] = _turn(cosines[robot], sines[robot], c, s)
-        along, across = _turn(x - before[robot, 0], y - before[robot, 1], c, s)
-        full[rate], full[rate + 1] = along / (period * SPEED_SCALE_MPS), across / (period * SPEED_SCALE_MPS)
-        full[rate + 2] = wrap(heading - before[robot, 2]) / period
+        full[row, pose], full[row, pose + 1] = along * _PER_LENGTH, across * _PER_LENGTH
+        full[row, pose + 3], full[row, pose + 2] = _turn(cosines[angle + robot], sines[angle + robot], c, s)
+        along, across = _turn(x - before[i, robot, 0], y - before[i, robot, 1], c, s)
+        full[row, rate], full[row, rate + 1] = along * per_speed, across * per_speed
+        full[row, rate + 2] = wrap(heading - before[i, robot, 2]) * per_period
         for k in range(1, PREVIEW):
-            at = _PREVIEW + 6 * (k - 1) + 3 * robot
-            along, across = _turn(references[k, robot, 0] - target_x, references[k, robot, 1] - target_y, c, s)
-            full[at], full[at + 1] = along / PREVIEW_SCALE_M, across / PREVIEW_SCALE_M
-            full[at + 2] = wrap(references[k, robot, 2] - target_heading)
-    full[_SEPARATION] = math.hypot(measured[1, 0] - measured[0, 0], measured[1, 1] - measured[0, 1]) / LENGTH_SCALE_M
-    full[_FRAME], full[_FRAME + 1] = frame_s, frame_c
-    for k in range(len(epms)):
+            at, ahead = _PREVIEW + 6 * (k - 1) + 3 * robot, target + k
+            full[row, at], full[row, at + 1] = _turn(previews[ahead, robot, 0], previews[ahead, robot, 1], c, s)
+            full[row, at + 2] = previews[ahead, robot, 2]
+    dx, dy = measured[i, 1, 0] - measured[i, 0, 0], measured[i, 1, 1] - measured[i, 0, 1]
+    full[row, _SEPARATION] = math.sqrt(dx * dx + dy * dy) * _PER_LENGTH
+    full[row, _FRAME], full[row, _FRAME + 1] = frame_s, frame_c
+    for k in range(epms.shape[1]):
         at = _EPMS + _EPM_SIZE * k
-        x, y, z = epms[k, 0], epms[k, 1], epms[k, 2]
+        x, y, z = epms[i, k, 0], epms[i, k, 1], epms[i, k, 2]
         radius = math.sqrt(x * x + y * y + z * z)
-        full[at], full[at + 1] = _turn(x / radius, y / radius, c, s)
-        full[at + 2], full[at + 3] = z / radius, radius / r_max
-        full[at + 4], full[at + 5] = _turn(epms[k, 3], epms[k, 4], c, s)
-        full[at + 6] = epms[k, 5]
+        per_radius = 1.0 / radius
+        full[row, at], full[row, at + 1] = _turn(x * per_radius, y * per_radius, c, s)
+        full[row, at + 2], full[row, at + 3] = z * per_radius, radius * (1.0 / r_max)
+        full[row, at + 4], full[row, at + 5] = _turn(epms[i, k, 3], epms[i, k, 4], c, s)
+        full[row, at + 6] = epms[i, k, 5]
 
 
 @kernel
@@ -180,31 +207,44 @@ def observe_rows(
 ) -> None:
     """Write the observations (n, d) of rows ``first`` to ``last`` where ``mask`` says; see ``World`` for the rest."""
     block = min(_BLOCK, last - first)
-    references = np.empty((block, PREVIEW, 2, 3))
-    angles, sines, cosines = np.empty(4 * block), np.empty(4 * block), np.empty(4 * block)
-    full = np.empty(_EPMS + _EPM_SIZE * epms.shape[1])
+    references, previews = np.empty((PREVIEW * block, 2, 3)), np.empty((PREVIEW * block, 2, 3))
+    turns = np.empty((3, 4 * block))
+    full = np.empty((block, _EPMS + _EPM_SIZE * epms.shape[1]))
+    rows, targets = np.empty(block, np.int64), np.empty(block, np.int64)
     for start in range(first, last, _BLOCK):
-        end, count = min(start + _BLOCK, last), 0
-        for i in range(start, end):
+        count, target, which, now = 0, -PREVIEW, -1, -1
+        for i in range(start, min(start + _BLOCK, last)):
             if mask[i]:
-                which, reference = trajectory_of(i, len(duration)), references[count]
-                for k in range(PREVIEW):
-                    reference_kernel(coefficients[which], duration[which], (step[i] + 1 + k) * period, reference[k])
+                if which != trajectory_of(i, len(duration)) or now != step[i]:  # else as the row before
+                    which, now = trajectory_of(i, len(duration)), step[i]
+                    target += PREVIEW
+                    _preview(coefficients, which, duration[which], now, period, references, previews, target)
+                rows[count], targets[count] = i, target
                 for robot in range(2):
-                    angles[4 * count + robot] = measured[i, robot, 2]
-                    angles[4 * count + 2 + robot] = reference[0, robot, 2] - measured[i, robot, 2]
+                    turns[0, 4 * count + robot] = measured[i, robot, 2]
+                    turns[0, 4 * count + 2 + robot] = references[target, robot, 2] - measured[i, robot, 2]
                 count += 1
-        sincos_all(angles, 4 * count, sines, cosines)
-        count = 0
-        for i in range(start, end):
-            if not mask[i]:
-                continue
-            at = slice(4 * count, 4 * count + 4)
-            reference, s, c = references[count], sines[at], cosines[at]
-            count += 1
-            _observe(measured[i], before[i], reference, epms[i], period, r_max, carried, s, c, full)
+        sincos_all(turns[0], 4 * count, turns[1], turns[2])
+        for k in range(count):
+            _observe(
+                rows[k],
+                measured,
+                before,
+                targets[k],
+                references,
+                previews,
+                epms,
+                period,
+                r_max,
+                carried,
+                turns,
+                full,
+                k,
+            )
+        for k in range(count):
+            i = rows[k]
             for j in range(out.shape[1]):
-                value = np.float32(full[j]) if abs(full[j]) < math.inf else np.float32(0.0)
+                value = np.float32(full[k, j]) if abs(full[k, j]) < math.inf else np.float32(0.0)
                 out[i, j] = min(max(value, -bounds[j]), bounds[j])
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.angles import arctan2, sincos, wrap
 from magenv.kernels import kernel, law
 from magenv.params import require
+from magenv.random_knots import RANDOM_TURN_MAX_RADPS, try_knots
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -22,6 +22,7 @@ Keys = NDArray[np.uint64]
 
 SEGMENTS = 32
 """Spline segments of every trajectory."""
+_KNOTS = SEGMENTS + 1
 _AXES = 6  # x, y, heading of both robots
 DURATION_S = 100.0
 HALF_LENGTH_M = 0.060
@@ -32,18 +33,10 @@ HALF_WIDTH_M = 0.050
 SCENARIO_HELP = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
 _APPROACH = re.compile(r"approach-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)
 
-RANDOM_SEPARATION_M = (0.025, 0.100)
-"""Range of the least separation in the random family."""
-_RANDOM_RADIUS_M = 0.082
-_RANDOM_SPEED_MIN_MPS = 2e-4
-_RANDOM_TURN_MAX_RADPS = 0.1
-_GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Spline of both robots' reference: ``coefficients`` (2 robots, 32 segments, x / y / heading, 4 powers)."""
+    """Spline of both robots' reference: ``coefficients`` (32 segments, 2 robots, x / y / heading, 4 powers)."""
 
     duration_s: float
     coefficients: Floats
@@ -51,7 +44,7 @@ class Trajectory:
     @classmethod
     def through(cls, duration_s: float, knots: Floats) -> Trajectory:
         """Return the twice continuously differentiable spline through ``knots`` (33, 2, 3), equally spaced in time."""
-        coefficients = np.empty((2, SEGMENTS, 3, 4))
+        coefficients = np.empty((SEGMENTS, 2, 3, 4))
         spline_through(np.ascontiguousarray(knots), np.empty((SEGMENTS + 1, 2, 3)), coefficients)
         return cls(duration_s, coefficients)
 
@@ -80,31 +73,55 @@ def trajectory_of(row: int, trajectories: int) -> int:
     return min(row, trajectories - 1)
 
 
+@law
+def _place_on_spline(time: float, duration: float) -> tuple[int, float]:
+    """Return the segment at ``time`` (s) and how far in it it is, in segments."""
+    position = spline_position(time, SEGMENTS / duration)
+    segment = min(int(position), SEGMENTS - 1)
+    return segment, position - segment
+
+
+@law
+def reference_of(coefficients: Floats, which: int, duration: float, time: float, out: Floats, row: int) -> None:
+    """Write the reference at ``time`` (s) of one of many trajectories into a row of ``out`` (k, 2, 3)."""
+    segment, u = _place_on_spline(time, duration)
+    for robot in range(2):
+        for axis in range(3):
+            c0, c1 = coefficients[which, segment, robot, axis, 0], coefficients[which, segment, robot, axis, 1]
+            c2, c3 = coefficients[which, segment, robot, axis, 2], coefficients[which, segment, robot, axis, 3]
+            out[row, robot, axis] = cubic(c0, c1, c2, c3, u)
+
+
 @kernel
 def reference_kernel(coefficients: Floats, duration: float, time: float, out: Floats) -> None:
     """Write the reference (2, 3) at ``time`` (s) into ``out``."""
-    position = spline_position(time, SEGMENTS / duration)
-    segment = min(int(position), SEGMENTS - 1)
-    u = position - segment
+    segment, u = _place_on_spline(time, duration)
     for robot in range(2):
         for axis in range(3):
-            c = coefficients[robot, segment, axis]
+            c = coefficients[segment, robot, axis]
             out[robot, axis] = cubic(c[0], c[1], c[2], c[3], u)
+
+
+def _inverse_pivots() -> Floats:
+    """Return the reciprocal pivots (32,) of the Gaussian elimination in ``spline_through``, from the second on."""
+    inverse = np.full(SEGMENTS, 0.5)
+    for k in range(2, SEGMENTS):
+        inverse[k] = 1.0 / ((2.0 if k == SEGMENTS - 1 else 4.0) - inverse[k - 1])
+    return inverse
+
+
+_INVERSE_PIVOTS = _inverse_pivots()
 
 
 @kernel
 def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
-    """Write the coefficients (2, 32, 3, 4) of the cubic spline through ``knots`` (33, 2, 3), ends not-a-knot.
+    """Write the coefficients (32, 2, 3, 4) of the cubic spline through ``knots`` (33, 2, 3), ends not-a-knot.
 
     The slopes at the knots (scratch, like ``knots``) make the second derivative continuous,
     s[k-1] + 4 s[k] + s[k+1] = 3 (y[k+1] - y[k-1]), and the third at the first and last inner knot,
     s[0] + 2 s[1] = (-5 y[0] + 4 y[1] + y[2]) / 2 and its mirror image: a tridiagonal system without the end slopes.
     """
-    end, y, s = SEGMENTS, knots.reshape(-1, _AXES), slopes.reshape(-1, _AXES)
-    inverse = np.empty(SEGMENTS)  # of the pivots of Gaussian elimination
-    inverse[1] = 0.5
-    for k in range(2, end):
-        inverse[k] = 1.0 / ((2.0 if k == end - 1 else 4.0) - inverse[k - 1])
+    end, y, s, inverse = SEGMENTS, knots.reshape(-1, _AXES), slopes.reshape(-1, _AXES), _INVERSE_PIVOTS
     for j in range(_AXES):
         s[0, j] = 0.5 * (-5.0 * y[0, j] + 4.0 * y[1, j] + y[2, j])
         s[end, j] = 0.5 * (5.0 * y[end, j] - 4.0 * y[end - 1, j] - y[end - 2, j])
@@ -122,7 +139,7 @@ def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
         s[end, j] -= 2.0 * s[end - 1, j]
     for k in range(end):
         for j in range(_AXES):
-            c, rise, s0, s1 = coefficients[j // 3, k, j % 3], y[k + 1, j] - y[k, j], s[k, j], s[k + 1, j]
+            c, rise, s0, s1 = coefficients[k, j // 3, j % 3], y[k + 1, j] - y[k, j], s[k, j], s[k + 1, j]
             c[0], c[1], c[2], c[3] = y[k, j], s0, 3.0 * rise - 2.0 * s0 - s1, s0 + s1 - 2.0 * rise
 
 
@@ -167,71 +184,6 @@ def named_trajectory(scenario: str) -> Trajectory | None:
     return approach(float(match[1]) / 1000, anti=match[2] is not None)
 
 
-@law
-def _uniform(stream: Keys, low: float, high: float) -> float:
-    """Return a number from [low, high) of the stream (1,): SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
-    stream[0] += _GOLDEN
-    z = stream[0]
-    z = (z ^ (z >> _S30)) * _MIX_1
-    z = (z ^ (z >> _S27)) * _MIX_2
-    z = z ^ (z >> _S31)
-    return low + (high - low) * (float(z >> _S11) * 2.0**-53)
-
-
-@law
-def _normal(stream: Keys, deviation: float) -> float:
-    """Return a normally distributed number of mean zero (Box and Muller, 1958)."""
-    radius = math.sqrt(-2.0 * math.log(1.0 - _uniform(stream, 0.0, 1.0)))
-    _, cosine = sincos(_uniform(stream, 0.0, 2.0 * math.pi))
-    return deviation * radius * cosine
-
-
-@kernel
-def _try_knots(stream: Keys, duration: float, turn_max: float, knots: Floats) -> bool:
-    """Draw a candidate and write its knots (33, 2, 3); return whether it is allowed, with knots written only then.
-
-    The robots' midpoint travels through the workspace in a random direction on a bent path, while the line between
-    them turns slowly and its length falls to a random least separation and grows again; either robot may be on the
-    left. Headings are along the paths. Draws that leave the workspace, nearly stop or turn fast are not allowed.
-    """
-    a, b = _uniform(stream, *RANDOM_SEPARATION_M), _uniform(stream, *RANDOM_SEPARATION_M)
-    closest, wider = min(a, b), abs(a - b)
-    moment = _uniform(stream, -0.6, 0.6)
-    bend0, bend1, bend2 = _normal(stream, 0.010), _normal(stream, 0.010), _normal(stream, 0.006)
-    line0, line1, line2 = _normal(stream, 0.35), _normal(stream, 0.25), _normal(stream, 0.25)
-    line0 += -0.5 * math.pi if _uniform(stream, 0.0, 1.0) < 0.5 else 0.5 * math.pi
-    half_length = _uniform(stream, 0.030, 0.065)
-    turn_s, turn_c = sincos(_uniform(stream, -math.pi, math.pi))
-    for k in range(SEGMENTS + 1):
-        u = 2.0 * k / SEGMENTS - 1.0  # time from -1 to 1
-        since = (u - moment) / (1.0 + abs(moment))
-        distance, distance_rate = closest + wider * since * since, 2.0 * wider * since / (1.0 + abs(moment))
-        x, y = half_length * u, bend0 + u * u * (bend1 + u * bend2)
-        x_rate, y_rate = half_length, u * (2.0 * bend1 + 3.0 * u * bend2)
-        s, c = sincos(line0 + u * (line1 + u * line2))
-        angle_rate = line1 + 2.0 * u * line2
-        half_x, half_y = 0.5 * distance * c, 0.5 * distance * s
-        half_x_rate = 0.5 * (distance_rate * c - distance * angle_rate * s)
-        half_y_rate = 0.5 * (distance_rate * s + distance * angle_rate * c)
-        for robot in range(2):
-            side = 2.0 * robot - 1.0
-            px, py = x + side * half_x, y + side * half_y
-            vx, vy = x_rate + side * half_x_rate, y_rate + side * half_y_rate
-            if px * px + py * py > _RANDOM_RADIUS_M * _RANDOM_RADIUS_M:
-                return False
-            if math.sqrt(vx * vx + vy * vy) * 2.0 / duration < _RANDOM_SPEED_MIN_MPS:
-                return False
-            knots[k, robot, 0], knots[k, robot, 1] = turn_c * px - turn_s * py, turn_s * px + turn_c * py
-            heading = arctan2(turn_s * vx + turn_c * vy, turn_c * vx - turn_s * vy)
-            if k > 0:
-                before = knots[k - 1, robot, 2]
-                heading = before + wrap(heading - before)
-                if abs(heading - before) * SEGMENTS / duration > turn_max:
-                    return False
-            knots[k, robot, 2] = heading
-    return True
-
-
 @kernel
 def draw_rows(
     first: int,
@@ -244,15 +196,16 @@ def draw_rows(
     coefficients: Floats,
     duration: Floats,
 ) -> None:
-    """Draw trajectories (n, 2, 32, 3, 4) and (n,) where ``mask`` says, of rows first to last.
+    """Draw trajectories (n, 32, 2, 3, 4) and (n,) where ``mask`` says, of rows first to last.
 
     Each from the first of its row's keys (n, k) after the ``used`` ones (n,).
     """
-    knots, slopes, stream = np.empty((SEGMENTS + 1, 2, 3)), np.empty((SEGMENTS + 1, 2, 3)), np.empty(1, np.uint64)
+    knots, slopes, stream = np.empty((_KNOTS, 2, 3)), np.empty((_KNOTS, 2, 3)), np.empty(1, np.uint64)
+    lanes = np.empty((_AXES + 2, _KNOTS))
     for i in range(first, last):
         if mask[i]:
             stream[0] = keys[i, used[i]]
-            while not _try_knots(stream, duration_s, turn_max, knots):
+            while not try_knots(stream, duration_s, turn_max, lanes, knots):
                 pass
             spline_through(knots, slopes, coefficients[i])
             duration[i] = duration_s
@@ -260,7 +213,7 @@ def draw_rows(
 
 def random_limits() -> tuple[float, float]:
     """Return duration (s) and greatest turn rate (rad/s) of the random family."""
-    return DURATION_S, _RANDOM_TURN_MAX_RADPS
+    return DURATION_S, RANDOM_TURN_MAX_RADPS
 
 
 def draw_keys(rng: np.random.Generator, n: int) -> Keys:
@@ -279,7 +232,7 @@ def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
     named = named_trajectory(scenario)
     if named is not None:
         return named
-    coefficients, duration = np.empty((1, 2, SEGMENTS, 3, 4)), np.empty(1)
+    coefficients, duration = np.empty((1, SEGMENTS, 2, 3, 4)), np.empty(1)
     keys, used = draw_keys(rng, 1)[None], np.zeros(1, np.int64)
     draw_rows(0, 1, np.ones(1, np.bool_), keys, used, *random_limits(), coefficients, duration)
     return Trajectory(float(duration[0]), coefficients[0])

@@ -17,7 +17,7 @@ from magenv.kernels import kernel, law
 from magenv.lanes import CONSTANTS_SIZE
 from magenv.params import Plant, System, TaskParams
 from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
-from magenv.trajectories import SEGMENTS, Trajectory, reference_kernel, trajectory_of
+from magenv.trajectories import SEGMENTS, Trajectory, reference_of, trajectory_of
 from magenv.workers import Workers
 
 __all__ = ["LOSSES", "Measurements", "World"]
@@ -74,6 +74,12 @@ class Measurements:
         raise AttributeError(name)
 
 
+@law
+def _distance(dx: float, dy: float) -> float:
+    """Return the length of (dx, dy): without the call that ``math.hypot`` is."""
+    return math.sqrt(dx * dx + dy * dy)
+
+
 @kernel
 def begin_rows(
     first: int,
@@ -88,17 +94,17 @@ def begin_rows(
     counts: Integers,
 ) -> None:
     """Begin episodes where ``mask`` says, with the states and trajectories that the rows hold."""
-    reference = np.empty((2, 3))
+    reference = np.empty((1, 2, 3))
     for i in range(first, last):
         if mask[i]:
             step[i] = 0
             counts[1, i] = 0
             which = trajectory_of(i, len(duration))
-            reference_kernel(coefficients[which], duration[which], 0.0, reference)
-            away1 = math.hypot(robots[i, 0, 0] - reference[0, 0], robots[i, 0, 1] - reference[0, 1])
-            away2 = math.hypot(robots[i, 1, 0] - reference[1, 0], robots[i, 1, 1] - reference[1, 1])
-            apart = math.hypot(robots[i, 1, 0] - robots[i, 0, 0], robots[i, 1, 1] - robots[i, 0, 1])
-            numbers[5, i] = apart if max(away1, away2) <= tracking_distance else math.nan
+            reference_of(coefficients, which, duration[which], 0.0, reference, 0)
+            (x1, y1), (x2, y2) = (robots[i, 0, 0], robots[i, 0, 1]), (robots[i, 1, 0], robots[i, 1, 1])
+            away1 = _distance(x1 - reference[0, 0, 0], y1 - reference[0, 0, 1])
+            away2 = _distance(x2 - reference[0, 1, 0], y2 - reference[0, 1, 1])
+            numbers[5, i] = _distance(x2 - x1, y2 - y1) if max(away1, away2) <= tracking_distance else math.nan
 
 
 @law
@@ -131,7 +137,11 @@ def describe_rows(
         while i < last and mask[i]:
             which = trajectory_of(i, len(duration))
             time[i] = time_of(step[i], counts[0, i], counts[1, i], period, substeps)
-            reference_kernel(coefficients[which], duration[which], time[i], references[i])
+            if i > start and which < i and time[i] == time[i - 1]:  # on one trajectory for all, as the row before
+                for j in range(6):
+                    references[i, j // 3, j % 3] = references[i - 1, j // 3, j % 3]
+            else:
+                reference_of(coefficients, which, duration[which], time[i], references, i)
             i += 1
         if i > start:  # neighbours together, so that their angles are vectorised
             epms_to_poses(epms.reshape(-1, EPM_SIZE), start * n_epm, i * n_epm, poses.reshape(-1, POSE_SIZE))
@@ -161,7 +171,7 @@ class World:
         Centres (m) and unit moments of the EPMs.
     step_count : ndarray, shape (n,)
         Control periods since the start.
-    coefficients, duration_s : ndarray, shape (n or 1, 2, 32, 3, 4) and (n or 1,)
+    coefficients, duration_s : ndarray, shape (n or 1, 32, 2, 3, 4) and (n or 1,)
         The trajectories; one where all rows follow the same.
     constants : ndarray, shape (n, 10)
         Of a substep, see ``magenv.dynamics.constants``.
@@ -191,7 +201,7 @@ class World:
         self.robots: Floats = np.zeros((n, 2, 6))
         self.epms: Floats = np.zeros((n, system.n_epm, 6))
         own = n if trajectory is None else 1
-        self.coefficients: Floats = np.zeros((own, 2, SEGMENTS, 3, 4))
+        self.coefficients: Floats = np.zeros((own, SEGMENTS, 2, 3, 4))
         self.duration_s: Floats = np.ones(own)
         if trajectory is not None:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s

@@ -32,6 +32,7 @@ ORDER = [
     "allocation_input",
     "allocation",
     "crosstalk",
+    "random_knots",
     "trajectories",
     "lanes",
     "dynamics",

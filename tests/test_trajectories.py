@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from magenv.params import Plant
-from magenv.trajectories import DURATION_S, RANDOM_SEPARATION_M, Trajectory, approach, draw
+from magenv.random_knots import RANDOM_SEPARATION_M
+from magenv.trajectories import DURATION_S, Trajectory, approach, draw
 
 Floats = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ def scalars(autoreset: AutoresetMode, **arguments: Any) -> SyncVectorEnv:
 def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """References of 1 s and no loss by deviation: both endings come often, by contact and by time."""
     monkeypatch.setattr(trajectories, "DURATION_S", 1.0)
-    monkeypatch.setattr(trajectories, "_RANDOM_TURN_MAX_RADPS", 10.0)
+    monkeypatch.setattr(trajectories, "RANDOM_TURN_MAX_RADPS", 10.0)
     monkeypatch.setattr(episodes, "TaskParams", functools.partial(TaskParams, loss_distance_m=1.0))
 
 
