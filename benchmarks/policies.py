@@ -64,4 +64,4 @@ def script(policy: Policy, settings: Settings, envs: int, steps: int, recorded: 
         starts = terminated | truncated
         actions.append(action)
     few.close()
-    return Script(settings, seeds, np.stack(actions)[:, seeds])
+    return Script(settings, seeds, np.ascontiguousarray(np.stack(actions)[:, seeds]))  # as a policy's are

@@ -1,7 +1,7 @@
 """Elementary functions of angles without branches and calls, so that loops in which they stand are vectorised.
 
-Accurate to two units in the last place for angles up to 1e5 rad; NaN in gives NaN out. The polynomials and the split
-of pi/2 are those of Moshier's Cephes library (sin.c, atan.c).
+Accurate to two units in the last place for angles up to 1e5 rad; NaN in gives NaN out. The polynomials are those of
+Moshier's Cephes library (sin.c, atan.c).
 """
 
 from __future__ import annotations
@@ -11,45 +11,44 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.arithmetic import fma
 from magenv.kernels import kernel, law
 
 Floats = NDArray[np.float64]
 
-# pi / 2 in three parts: the first two have trailing zeros, so that small multiples of them are exact.
-_HALF_PI_1, _HALF_PI_2, _HALF_PI_3 = 1.5707962512969971, 7.5497894158615964e-08, 5.390302858158119e-15
 _TURNS = 1.0 / (2.0 * math.pi)
 _QUARTERS = 2.0 / math.pi
 _HALF_PI_LOW = 6.123233995736765886130e-17
+"""What pi / 2 is above the nearest double."""
 _ATAN_SPLIT = 0.66
 
 
 @law
 def wrap(angle: float) -> float:
     """Return ``angle`` in [-pi, pi]."""
-    wrapped: float = angle - 2.0 * math.pi * np.floor(angle * _TURNS + 0.5)
-    return wrapped
+    return fma(-2.0 * math.pi, np.floor(fma(angle, _TURNS, 0.5)), angle)
 
 
 @law
 def sincos(angle: float) -> tuple[float, float]:
     """Return sine and cosine of ``angle`` (rad)."""
-    quarter = np.floor(angle * _QUARTERS + 0.5)
-    y = ((angle - quarter * _HALF_PI_1) - quarter * _HALF_PI_2) - quarter * _HALF_PI_3
+    quarter = np.floor(fma(angle, _QUARTERS, 0.5))
+    y = fma(-quarter, _HALF_PI_LOW, fma(-quarter, 0.5 * math.pi, angle))
     z = y * y
     sine = 1.58962301576546568060e-10
-    sine = sine * z - 2.50507477628578072866e-8
-    sine = sine * z + 2.75573136213857245213e-6
-    sine = sine * z - 1.98412698295895385996e-4
-    sine = sine * z + 8.33333333332211858878e-3
-    sine = sine * z - 1.66666666666666307295e-1
-    sine = y + y * z * sine
+    sine = fma(sine, z, -2.50507477628578072866e-8)
+    sine = fma(sine, z, 2.75573136213857245213e-6)
+    sine = fma(sine, z, -1.98412698295895385996e-4)
+    sine = fma(sine, z, 8.33333333332211858878e-3)
+    sine = fma(sine, z, -1.66666666666666307295e-1)
+    sine = fma(y * z, sine, y)
     cosine = -1.13585365213876817300e-11
-    cosine = cosine * z + 2.08757008419747316778e-9
-    cosine = cosine * z - 2.75573141792967388112e-7
-    cosine = cosine * z + 2.48015872888517045348e-5
-    cosine = cosine * z - 1.38888888888730564116e-3
-    cosine = cosine * z + 4.16666666666665929218e-2
-    cosine = 1.0 - (0.5 * z - z * z * cosine)
+    cosine = fma(cosine, z, 2.08757008419747316778e-9)
+    cosine = fma(cosine, z, -2.75573141792967388112e-7)
+    cosine = fma(cosine, z, 2.48015872888517045348e-5)
+    cosine = fma(cosine, z, -1.38888888888730564116e-3)
+    cosine = fma(cosine, z, 4.16666666666665929218e-2)
+    cosine = fma(z * z, cosine, fma(-0.5, z, 1.0))
     # quarter modulo 4, as fractions of a turn: 0, 1/4, 1/2, 3/4
     turn = 0.25 * quarter - np.floor(0.25 * quarter)
     odd = (turn == 0.25) | (turn == 0.75)
@@ -69,16 +68,16 @@ def arctan2(y: float, x: float) -> float:
     t = numerator / (1.0 if denominator == 0.0 else denominator)
     z = t * t
     p = -8.750608600031904122785e-1
-    p = p * z - 1.615753718733365076637e1
-    p = p * z - 7.500855792314704667340e1
-    p = p * z - 1.228866684490136173410e2
-    p = p * z - 6.485021904942025371773e1
+    p = fma(p, z, -1.615753718733365076637e1)
+    p = fma(p, z, -7.500855792314704667340e1)
+    p = fma(p, z, -1.228866684490136173410e2)
+    p = fma(p, z, -6.485021904942025371773e1)
     q = z + 2.485846490142306297962e1
-    q = q * z + 1.650270098316988542046e2
-    q = q * z + 4.328810604912902668951e2
-    q = q * z + 4.853903996359136964868e2
-    q = q * z + 1.945506571482613964425e2
-    angle = t + t * z * (p / q)
+    q = fma(q, z, 1.650270098316988542046e2)
+    q = fma(q, z, 4.328810604912902668951e2)
+    q = fma(q, z, 4.853903996359136964868e2)
+    q = fma(q, z, 1.945506571482613964425e2)
+    angle = fma(t * z, p / q, t)
     angle = (0.25 * math.pi + (angle + 0.5 * _HALF_PI_LOW)) if above else angle
     angle = (0.5 * math.pi - (angle - _HALF_PI_LOW)) if steep else angle
     angle = (math.pi - (angle - 2.0 * _HALF_PI_LOW)) if x < 0.0 else angle

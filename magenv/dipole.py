@@ -19,6 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magenv.arithmetic import dot3, fma, inverse_root
 from magenv.kernels import kernel, law
 from magenv.params import MU_0, require
 
@@ -28,13 +29,41 @@ _K = MU_0 / (4 * math.pi)
 
 
 @law
+def dipole_strengths(r2: float, m_r: float, n_r: float, m_n: float) -> tuple[float, float, float, float]:
+    """Return what the products |r|^2, m.r, n.r and m.n make of the field and the force of m on n at r.
+
+    (k, a, l, b) of B = k (a r - m) and F = l ((m.r) n + (n.r) m + b r), with r = position of n - position of m: with
+    k = mu0 / (4 pi |r|^3), a = 3 (m.r) / |r|^2, l = 3 k / |r|^2, b = m.n - 5 (m.r) (n.r) / |r|^2.
+    """
+    inverse_r = inverse_root(r2)
+    inverse_r2 = inverse_r * inverse_r
+    k = _K * inverse_r * inverse_r2
+    along = m_r * inverse_r2
+    return k, 3.0 * along, 3.0 * inverse_r2 * k, fma(-5.0 * along, n_r, m_n)
+
+
+@law
 def dipole_field(mx: float, my: float, mz: float, rx: float, ry: float, rz: float) -> tuple[float, float, float]:
     """Return B (T) of the moment m (A m^2) at r = point - source (m): k (3 (m.r^) r^ - m) / |r|^3."""
-    r2 = rx * rx + ry * ry + rz * rz
-    inverse_r2 = 1.0 / r2
-    k = _K * inverse_r2 * math.sqrt(inverse_r2)
-    along = 3.0 * (mx * rx + my * ry + mz * rz) * inverse_r2
-    return k * (along * rx - mx), k * (along * ry - my), k * (along * rz - mz)
+    k, along, _, _ = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), dot3(mx, my, mz, rx, ry, rz), 0.0, 0.0)
+    return k * fma(along, rx, -mx), k * fma(along, ry, -my), k * fma(along, rz, -mz)
+
+
+@law
+def dipole_force(
+    mx: float, my: float, mz: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
+) -> tuple[float, float, float]:
+    """Return the force (N) of the moment m on the moment n at r: the gradient times n, without the gradient.
+
+    3 k / |r|^4 ((m.r) n + (n.r) m + (m.n - 5 (m.r) (n.r)) r) with r the unit vector.
+    """
+    m_r, n_r = dot3(mx, my, mz, rx, ry, rz), dot3(nx, ny, nz, rx, ry, rz)
+    _, _, k, on_r = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), m_r, n_r, dot3(mx, my, mz, nx, ny, nz))
+    return (
+        k * dot3(m_r, n_r, on_r, nx, mx, rx),
+        k * dot3(m_r, n_r, on_r, ny, my, ry),
+        k * dot3(m_r, n_r, on_r, nz, mz, rz),
+    )
 
 
 @law
@@ -45,9 +74,9 @@ def dipole_gradient(
 
     3 k / |r|^4 (m r^T + r m^T + (m.r)(I - 5 r r^T)) with r the unit vector: symmetric, traceless.
     """
-    r2 = rx * rx + ry * ry + rz * rz
-    inverse_r2 = 1.0 / r2
-    k = 3.0 * _K * inverse_r2 * inverse_r2 * math.sqrt(inverse_r2)
+    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r2 = inverse_r * inverse_r
+    k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
     m_r = mx * rx + my * ry + mz * rz
     five = 5.0 * m_r * inverse_r2
     return (
@@ -68,9 +97,9 @@ def dipole_force_gradient(
 
     It is the second derivative of B contracted with n: d^2 B_k / dp_i dp_j n_k, symmetric and traceless.
     """
-    r2 = rx * rx + ry * ry + rz * rz
-    inverse_r2 = 1.0 / r2
-    k = 3.0 * _K * inverse_r2 * inverse_r2 * math.sqrt(inverse_r2)
+    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r2 = inverse_r * inverse_r
+    k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
     m_n = mx * nx + my * ny + mz * nz
     m_r = mx * rx + my * ry + mz * rz
     n_r = nx * rx + ny * ry + nz * rz
@@ -112,9 +141,9 @@ def dipole_force_hessian(
     -945 k / |r|^6 (r^5 - 1/9 sum_10 I r^3 + 1/63 sum_15 I I r) contracted with a, b and c, k = mu0 / (4 pi): the fifth
     derivative of 1/|r|, symmetric in a, b, c and in i, j, traceless.
     """
-    r2 = rx * rx + ry * ry + rz * rz
-    inverse_r2 = 1.0 / r2
-    k = -15.0 * _K * inverse_r2 * inverse_r2 * inverse_r2 * math.sqrt(inverse_r2)
+    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r2 = inverse_r * inverse_r
+    k = -15.0 * _K * inverse_r2 * inverse_r2 * inverse_r2 * inverse_r
     a_r, b_r, c_r = ax * rx + ay * ry + az * rz, bx * rx + by * ry + bz * rz, cx * rx + cy * ry + cz * rz
     a_b, a_c, b_c = ax * bx + ay * by + az * bz, ax * cx + ay * cy + az * cz, bx * cx + by * cy + bz * cz
     seven, sixty_three = 7.0 * inverse_r2, 63.0 * inverse_r2 * inverse_r2

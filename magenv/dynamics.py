@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.angles import sincos
+from magenv.arithmetic import cross2, dot2, fma
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     DECAY1,
@@ -41,7 +42,7 @@ from magenv.lanes import (
 )
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE
-from magenv.wrench import planar_dipole_wrench
+from magenv.wrench import add_planar_wrench
 
 Floats = NDArray[np.float64]
 
@@ -93,25 +94,22 @@ def planar_wrench(
 ) -> tuple[float, float, float, float, float, float]:
     """Return F_x, F_y (N) and tau_z (N m) on both robots of lane ``i`` at these poses, global frame.
 
-    Out-of-plane components are borne by the plane. The force between the robots is computed once and obeys Newton's
-    third law exactly; the torques differ.
+    Out-of-plane components are borne by the plane. Between the robots the wrench is computed once: their forces are
+    opposite, and their torques and the force's moment add up to nothing.
     """
     s, c = sincos(heading1)
     m1x, m1y = lanes[MOMENT1, i] * c, lanes[MOMENT1, i] * s
     s, c = sincos(heading2)
     m2x, m2y = lanes[MOMENT2, i] * c, lanes[MOMENT2, i] * s
     dx, dy = x2 - x1, y2 - y1
-    f2x, f2y, tz2 = planar_dipole_wrench(m1x, m1y, 0.0, m2x, m2y, dx, dy, 0.0)
-    _, _, tz1 = planar_dipole_wrench(m2x, m2y, 0.0, m1x, m1y, -dx, -dy, 0.0)
-    f1x, f1y = -f2x, -f2y
+    f2x, f2y, tz2 = add_planar_wrench(0.0, 0.0, 0.0, m1x, m1y, 0.0, m2x, m2y, dx, dy, 0.0)
+    f1x, f1y, tz1 = -f2x, -f2y, -cross2(dx, dy, f2x, f2y) - tz2
     for k in range(n_epm):
         e = EPMS + EPM_SIZE * k
         ex, ey, ez = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
         mx, my, mz = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
-        fx, fy, tz = planar_dipole_wrench(mx, my, mz, m1x, m1y, x1 - ex, y1 - ey, -ez)
-        f1x, f1y, tz1 = f1x + fx, f1y + fy, tz1 + tz
-        fx, fy, tz = planar_dipole_wrench(mx, my, mz, m2x, m2y, x2 - ex, y2 - ey, -ez)
-        f2x, f2y, tz2 = f2x + fx, f2y + fy, tz2 + tz
+        f1x, f1y, tz1 = add_planar_wrench(f1x, f1y, tz1, mx, my, mz, m1x, m1y, x1 - ex, y1 - ey, -ez)
+        f2x, f2y, tz2 = add_planar_wrench(f2x, f2y, tz2, mx, my, mz, m2x, m2y, x2 - ex, y2 - ey, -ez)
     return f1x, f1y, tz1, f2x, f2y, tz2
 
 
@@ -193,19 +191,18 @@ def advance(lanes: Floats, i: int, n_epm: int, h: float) -> None:
     half = 0.5 * h
     vx1, vy1, rate1 = lanes[VX1, i], lanes[VY1, i], lanes[RATE1, i]
     vx2, vy2, rate2 = lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i]
-    x1, y1, heading1 = lanes[X1, i] + half * vx1, lanes[Y1, i] + half * vy1, lanes[HEADING1, i] + half * rate1
-    x2, y2, heading2 = lanes[X2, i] + half * vx2, lanes[Y2, i] + half * vy2, lanes[HEADING2, i] + half * rate2
+    x1, y1, heading1 = fma(half, vx1, lanes[X1, i]), fma(half, vy1, lanes[Y1, i]), fma(half, rate1, lanes[HEADING1, i])
+    x2, y2, heading2 = fma(half, vx2, lanes[X2, i]), fma(half, vy2, lanes[Y2, i]), fma(half, rate2, lanes[HEADING2, i])
     f1x, f1y, tz1, f2x, f2y, tz2 = planar_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
-    vx1 = lanes[DECAY1, i] * vx1 + lanes[GAIN1, i] * f1x
-    vy1 = lanes[DECAY1, i] * vy1 + lanes[GAIN1, i] * f1y
-    rate1 = lanes[TURN_DECAY1, i] * rate1 + lanes[TURN_GAIN1, i] * tz1
-    vx2 = lanes[DECAY2, i] * vx2 + lanes[GAIN2, i] * f2x
-    vy2 = lanes[DECAY2, i] * vy2 + lanes[GAIN2, i] * f2y
-    rate2 = lanes[TURN_DECAY2, i] * rate2 + lanes[TURN_GAIN2, i] * tz2
+    # v = decay v + gain F
+    vx1, vy1 = dot2(lanes[DECAY1, i], lanes[GAIN1, i], vx1, f1x), dot2(lanes[DECAY1, i], lanes[GAIN1, i], vy1, f1y)
+    vx2, vy2 = dot2(lanes[DECAY2, i], lanes[GAIN2, i], vx2, f2x), dot2(lanes[DECAY2, i], lanes[GAIN2, i], vy2, f2y)
+    rate1 = dot2(lanes[TURN_DECAY1, i], lanes[TURN_GAIN1, i], rate1, tz1)
+    rate2 = dot2(lanes[TURN_DECAY2, i], lanes[TURN_GAIN2, i], rate2, tz2)
     lanes[VX1, i], lanes[VY1, i], lanes[RATE1, i] = vx1, vy1, rate1
     lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i] = vx2, vy2, rate2
-    lanes[X1, i], lanes[Y1, i], lanes[HEADING1, i] = x1 + half * vx1, y1 + half * vy1, heading1 + half * rate1
-    lanes[X2, i], lanes[Y2, i], lanes[HEADING2, i] = x2 + half * vx2, y2 + half * vy2, heading2 + half * rate2
+    lanes[X1, i], lanes[Y1, i], lanes[HEADING1, i] = fma(half, vx1, x1), fma(half, vy1, y1), fma(half, rate1, heading1)
+    lanes[X2, i], lanes[Y2, i], lanes[HEADING2, i] = fma(half, vx2, x2), fma(half, vy2, y2), fma(half, rate2, heading2)
 
 
 @law
@@ -214,5 +211,5 @@ def may_touch(lanes: Floats, i: int, diameter: float, wall_radius: float) -> boo
     near, far = diameter * _SLIGHTLY_MORE, (wall_radius - 0.5 * diameter) / _SLIGHTLY_MORE
     x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
     dx, dy = x2 - x1, y2 - y1
-    touch: bool = (dx * dx + dy * dy < near * near) | (x1 * x1 + y1 * y1 > far * far) | (x2 * x2 + y2 * y2 > far * far)
-    return touch
+    touch: bool = dot2(dx, dy, dx, dy) < near * near
+    return touch | (dot2(x1, y1, x1, y1) > far * far) | (dot2(x2, y2, x2, y2) > far * far)

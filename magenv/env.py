@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode
@@ -123,11 +124,11 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         ------
         ValueError
             If the action has the wrong shape or is not finite; nothing has moved then.
-        RuntimeError
+        gymnasium.error.ResetNeeded
             If no episode is running.
         """
         if not self._running:
-            raise RuntimeError("No episode is running; call reset() before step().")
+            raise ResetNeeded("No episode is running; call reset() before step().")
         observation, reward, terminated, truncated, info = self._episode.step(action)
         if terminated or truncated:
             self._running = False
@@ -142,7 +143,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             gymnasium.logger.warn("render() needs render_mode='human' or 'rgb_array' given to gymnasium.make.")
             return None
         if self._drawn_from is None:
-            raise RuntimeError("No episode has begun; call reset() before render().")
+            raise ResetNeeded("No episode has begun; call reset() before render().")
         if self._renderer is None:
             self._renderer = Renderer(self._episodes.system, self._episodes.plant, self.render_mode == "human")
         return self._renderer.draw(scene_of(self._episodes.world, 0))

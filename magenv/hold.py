@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.angles import wrap
+from magenv.arithmetic import dot2
 from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
-from magenv.kernels import kernel, law
+from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
     CONSTANTS,
@@ -86,14 +87,14 @@ def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, track
     """Add lane ``i`` at a substep's end to its measurements; return whether its hold is over."""
     x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
     dx, dy = x1 - _reference(lanes, i, 0), y1 - _reference(lanes, i, 1)
-    first = math.sqrt(dx * dx + dy * dy)
+    first = math.sqrt(dot2(dx, dy, dx, dy))
     dx, dy = x2 - _reference(lanes, i, 3), y2 - _reference(lanes, i, 4)
-    second = math.sqrt(dx * dx + dy * dy)
+    second = math.sqrt(dot2(dx, dy, dx, dy))
     position_error = 0.5 * (first + second)
     turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, 2)))
     turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, 5)))
     heading_error = 0.5 * (turned1 + turned2)
-    separation = math.sqrt((x2 - x1) * (x2 - x1) + (y2 - y1) * (y2 - y1))
+    separation = dot2(x2 - x1, y2 - y1, x2 - x1, y2 - y1)  # squared: the root is drawn once, at the end
     lanes[POSITION_ERROR, i] += position_error
     lanes[HEADING_ERROR, i] += heading_error
     lanes[POSITION_END, i] = position_error
@@ -125,7 +126,7 @@ def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
         return _WALL
     dx1, dy1 = lanes[X1, i] - _reference(lanes, i, 0), lanes[Y1, i] - _reference(lanes, i, 1)
     dx2, dy2 = lanes[X2, i] - _reference(lanes, i, 3), lanes[Y2, i] - _reference(lanes, i, 4)
-    first, second = math.sqrt(dx1 * dx1 + dy1 * dy1), math.sqrt(dx2 * dx2 + dy2 * dy2)
+    first, second = math.sqrt(dot2(dx1, dy1, dx1, dy1)), math.sqrt(dot2(dx2, dy2, dx2, dy2))
     return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
 
 
@@ -160,6 +161,7 @@ def hold_rows(
     compute on, unseen. The lengths of the last two tuples, which are types to numba, are the numbers of EPMs and of
     lanes: constants of the machine code, so that the magnets are unrolled and the lanes vectorised.
     """
+    wide_vectors()
     n_epm, width = len(magnets), len(side_by_side)
     lanes, bodies = np.zeros((fields(n_epm), width)), np.empty((2, STATE_SIZE))
     rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
@@ -193,7 +195,7 @@ def hold_rows(
                     _load_segment(lanes, i, position, coefficients[which])
                     lanes[POSITION_ERROR, i], lanes[HEADING_ERROR, i] = 0.0, 0.0
                     lanes[SEPARATION_MIN, i] = math.inf
-                    lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row]
+                    lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row] ** 2
             if busy == 0:
                 return
         rare = False
@@ -223,6 +225,8 @@ def hold_rows(
                         numbers[j, row] = lanes[MEASURED + j, i]
                     numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
                     numbers[HEADING_ERROR - MEASURED, row] /= lanes[DONE, i]
+                    for j in (SEPARATION_MIN, SEPARATION_TRACKED):
+                        numbers[j - MEASURED, row] = math.sqrt(lanes[j, i])
                     counts[0, row], counts[1, row] = int(lanes[DONE, i]), _loss(lanes, i, loss_distance)
                     step[row] += 1
                     rows[i], idle = -1, True

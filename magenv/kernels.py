@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba import types
+from numba.extending import intrinsic
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -65,3 +67,19 @@ def law(function: Function) -> Function:
     Only so can LLVM vectorise the loop; the law still stands once.
     """
     return _compile(function, inlined=True)
+
+
+def _wide_vectors(typing_context: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # llvmlite lists the attributes it knows, but writes out others as well.
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.none(), generate
+
+
+wide_vectors = cast("Callable[[], None]", intrinsic(_wide_vectors))
+"""Let LLVM use vectors of 512 bits in the kernel that calls this, where the processor has them.
+
+By default it takes 256 bits at most, for the sake of programs in which few vectors stand among other work.
+"""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.arithmetic import fma
 from magenv.kernels import kernel, law
 from magenv.params import require
 from magenv.random_knots import RANDOM_TURN_MAX_RADPS, try_knots
@@ -58,7 +59,7 @@ class Trajectory:
 @law
 def cubic(c0: float, c1: float, c2: float, c3: float, u: float) -> float:
     """Return the value at ``u`` segments after a segment's beginning."""
-    return c0 + u * (c1 + u * (c2 + u * c3))
+    return fma(u, fma(u, fma(u, c3, c2), c1), c0)
 
 
 @law

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -107,13 +108,13 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         ------
         ValueError
             If the actions have the wrong shape or are not finite; nothing has moved then.
-        RuntimeError
+        gymnasium.error.ResetNeeded
             If an episode has ended and was not reset (``Disabled``), or none has begun.
         """
         if not self._begun.all():
-            raise RuntimeError("No episodes are running; call reset() before step().")
+            raise ResetNeeded("No episodes are running; call reset() before step().")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
-            raise RuntimeError(
+            raise ResetNeeded(
                 f"Episodes {np.flatnonzero(self._ended).tolist()} have ended; reset them with a reset_mask."
             )
         checked = check_action(actions, (self.num_envs, self._episodes.actions.size))

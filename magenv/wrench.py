@@ -11,7 +11,15 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.dipole import dipole_field, dipole_force_gradient, dipole_force_hessian, dipole_gradient
+from magenv.arithmetic import cross2, dot2, dot3, fma
+from magenv.dipole import (
+    dipole_field,
+    dipole_force,
+    dipole_force_gradient,
+    dipole_force_hessian,
+    dipole_gradient,
+    dipole_strengths,
+)
 from magenv.kernels import kernel, law
 from magenv.params import common_shape, require
 from magenv.poses import POSE_SIZE, pose_to_epm
@@ -31,25 +39,32 @@ def dipole_wrench(
     tau = m x B and F = (grad B)^T m (paper, section II-A).
     """
     bx, by, bz = dipole_field(sx, sy, sz, rx, ry, rz)
-    xx, xy, xz, yy, yz, zz = dipole_gradient(sx, sy, sz, rx, ry, rz)
-    return (
-        my * bz - mz * by,
-        mz * bx - mx * bz,
-        mx * by - my * bx,
-        xx * mx + xy * my + xz * mz,
-        xy * mx + yy * my + yz * mz,
-        xz * mx + yz * my + zz * mz,
-    )
+    fx, fy, fz = dipole_force(sx, sy, sz, mx, my, mz, rx, ry, rz)
+    return my * bz - mz * by, mz * bx - mx * bz, mx * by - my * bx, fx, fy, fz
 
 
 @law
-def planar_dipole_wrench(
-    sx: float, sy: float, sz: float, mx: float, my: float, rx: float, ry: float, rz: float
+def add_planar_wrench(
+    fx: float,
+    fy: float,
+    tz: float,
+    sx: float,
+    sy: float,
+    sz: float,
+    mx: float,
+    my: float,
+    rx: float,
+    ry: float,
+    rz: float,
 ) -> tuple[float, float, float]:
-    """Return F_x, F_y (N) and tau_z (N m) of ``dipole_wrench`` for a moment m in the plane: no more is computed."""
-    bx, by, _ = dipole_field(sx, sy, sz, rx, ry, rz)
-    xx, xy, _, yy, _, _ = dipole_gradient(sx, sy, sz, rx, ry, rz)
-    return xx * mx + xy * my, xy * mx + yy * my, mx * by - my * bx
+    """Return F_x, F_y (N) and tau_z (N m) with those of ``dipole_wrench`` added, for a moment m in the plane."""
+    s_r, m_r = dot3(sx, sy, sz, rx, ry, rz), dot2(mx, my, rx, ry)
+    k_field, along, k_force, on_r = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), s_r, m_r, dot2(sx, sy, mx, my))
+    return (
+        fma(k_force, dot3(s_r, m_r, on_r, mx, sx, rx), fx),
+        fma(k_force, dot3(s_r, m_r, on_r, my, sy, ry), fy),
+        fma(k_field, cross2(mx, my, fma(along, rx, -sx), fma(along, ry, -sy)), tz),
+    )
 
 
 @kernel

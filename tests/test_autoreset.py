@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from rollouts import AUTORESETS, MakeEnv, N, Record, assert_same_bits, assert_same_info, info_of, vector
 
@@ -73,7 +74,7 @@ def test_disabled_mode_waits_for_the_mask() -> None:
     env = vector(autoreset=AutoresetMode.DISABLED, scenario="approach-60", control_hz=20.0)
     env.reset(seed=0)
     observations, _, terminated, _, _ = end_row(env, 2)
-    with pytest.raises(RuntimeError, match=r"\[2\] have ended"):
+    with pytest.raises(ResetNeeded, match=r"\[2\] have ended"):
         env.step(np.zeros((N, 10), np.float32))
     again, info = env.reset(options={"reset_mask": terminated})
     keep = [0, 1, 3]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from rollouts import MakeEnv, Step, rollout, still
 
@@ -42,7 +43,7 @@ def test_end_of_the_reference_truncates(make_env: MakeEnv, stuck_plant: str, con
         assert ("is_success" in info) == (step == steps)
     assert info["is_success"] is True
     assert LOSSES[info["loss"]] == "none"
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
         env.step(still(env))
 
 
@@ -78,7 +79,7 @@ def lost(env: TwoRobots, poses: Floats, step: int = 0) -> dict[str, Any]:
     assert not truncated
     assert info["is_success"] is False
     assert info["substeps"] == 1
-    with pytest.raises(RuntimeError):
+    with pytest.raises(ResetNeeded):
         env.step(still(env))
     return info
 

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from rollouts import MODES, MakeEnv, assert_same_bits, assert_same_rollouts, rollout, still
@@ -113,7 +114,7 @@ def test_default_action_mode_is_home(make_env: MakeEnv) -> None:
 
 def test_step_before_reset_is_told(make_env: MakeEnv) -> None:
     env = make_env()
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
         env.step(still(env))
 
 
@@ -159,7 +160,7 @@ def test_caller_cannot_reach_into_the_env(make_env: MakeEnv) -> None:
 
 def test_render_before_reset_is_told() -> None:
     env = gymnasium.make(magenv.ENV_ID, render_mode="rgb_array")
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
         env.render()
 
 

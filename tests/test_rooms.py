@@ -18,6 +18,7 @@ ORDER = [
     "params",
     "kernels",
     "state",
+    "arithmetic",
     "angles",
     "workers",
     "dipole",

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from numpy.typing import NDArray
@@ -228,5 +229,5 @@ def test_gymnasiums_vector_wrappers_go_round_it() -> None:
 
 
 def test_no_episode_before_reset() -> None:
-    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
         vector(2).step(np.zeros((2, 10), np.float32))
