@@ -89,10 +89,3 @@ def sincos_all(angles: Floats, count: int, sines: Floats, cosines: Floats) -> No
     """Write sines and cosines of the first ``count`` angles: vectorised, a quarter of the time of one by one."""
     for i in range(count):
         sines[i], cosines[i] = sincos(angles[i])
-
-
-@kernel
-def arctan2_all(y: Floats, x: Floats, count: int, angles: Floats) -> None:
-    """Write the angles of the first ``count`` vectors (x, y), vectorised as ``sincos_all``."""
-    for i in range(count):
-        angles[i] = arctan2(y[i], x[i])

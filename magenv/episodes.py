@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
-from magenv.params import PLANTS, InputError, System, TaskParams, choose, require
+from magenv.params import PLANTS, InputError, System, TaskParams, choose, is_whole, require
 from magenv.poses import POSE_SIZE
 from magenv.starts import Starts
 from magenv.state import State, packed
@@ -83,7 +83,7 @@ class Episodes:
     """
 
     def __init__(self, n: int, settings: Settings, threads: int = 1) -> None:
-        require(settings.n_epm in (2, 3) and not isinstance(settings.n_epm, bool), "n_epm", "2 or 3", settings.n_epm)
+        require(is_whole(settings.n_epm) and settings.n_epm in (2, 3), "n_epm", "2 or 3", settings.n_epm)
         plant = self.plant = choose(PLANTS, "plant", settings.plant)
         trajectory = named_trajectory(settings.scenario)
         self.settings = settings
