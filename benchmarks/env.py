@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.floor import Kernels, nothing
 from benchmarks.measure import EXTRA, Contestant, Effort, Times, installed, on_cores, side_by_side, tell
 from benchmarks.peak import gain_of_two, multiply_adds
 from benchmarks.policies import POLICIES, Policy, Script, make_batch, script
@@ -212,18 +213,23 @@ def _single(env: gymnasium.Env[Any, Any], actions: NDArray[Any], seed: int | Non
 
 
 def _scalar(effort: Effort) -> Iterator[Row]:
-    """One environment at a time through ``gymnasium.make``."""
+    """One environment at a time through ``gymnasium.make``, and what none of them can go below."""
     steps = effort.scalar_steps
     cartpole = gymnasium.make("CartPole-v1", disable_env_checker=True)
     contestants = {"CartPole-v1": _single(cartpole, np.random.default_rng(0).integers(0, 2, steps))}
+    limits: dict[str, Limit | None] = {}
     for policy in POLICIES:
         given = script(policy, CASES[BASE], 1, min(steps, EPISODE), 1)
         actions = np.resize(given.actions[:, 0], (steps, *given.actions.shape[2:]))
         env = gymnasium.make(ENV_ID, disable_env_checker=True, **asdict(given.settings))
-        contestants[policy] = _single(env, actions, seed=0 if policy == "control" else None)
+        name = f"make, {BASE}, {policy}"
+        contestants[name], limits[name] = _single(env, actions, seed=0 if policy == "control" else None), Limit(1.3)
+        if policy == "control":
+            floor = {"make, an env that does nothing": _single(nothing(), actions)}
+            floor[f"a step's kernels without Python, {BASE}, {policy}"] = Kernels(given.settings, actions).contestant()
+    contestants |= floor
     times = side_by_side(contestants, effort.repeats)
-    for policy in POLICIES:
+    for name, limit in (limits | dict.fromkeys(floor)).items():
         peer = "CartPole-v1"
-        ratio = times.speedup(policy, peer)
-        what = f"make, {BASE}, {policy}"
-        yield Row(what, times.rate(policy), "steps/s", f"Gymnasium {peer}", times.rate(peer), ratio, Limit(1.3))
+        ratio = times.speedup(name, peer)
+        yield Row(name, times.rate(name), "steps/s", f"Gymnasium {peer}", times.rate(peer), ratio, limit)

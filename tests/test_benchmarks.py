@@ -8,16 +8,19 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
 import benchmarks.__main__ as command
-from benchmarks import allocation, dipole, env, memory, peak, rollouts, start
+from benchmarks import allocation, dipole, env, floor, memory, peak, rollouts, start
 from benchmarks.machine import head
 from benchmarks.measure import Contestant, Effort, Times, on_cores, side_by_side
 from benchmarks.policies import script
 from benchmarks.table import HEAD, LeftOut, Limit, Line, Row, console, markdown, page, text
+from magenv import ENV_ID
 from magenv.allocation import allocate
 from magenv.poses import POSE_SIZE
 
@@ -68,6 +71,38 @@ def test_script_of_zero_actions_loses_control_and_counts_it() -> None:
     resets, substeps = env.Batch(script("zero", env.CASES[env.BASE], 4, 20, 2), 4).observed()
     assert 0 < resets <= 1
     assert 0 < substeps < 50
+
+
+def test_an_env_that_does_nothing_answers_in_the_kinds_of_ours() -> None:
+    ours, none = (gymnasium.make(ENV_ID, disable_env_checker=True), floor.nothing())
+    kinds = []
+    for made in (ours, none):
+        action, answers = np.zeros(made.action_space.shape or 0, np.float32), []
+        for _ in range(2):
+            made.reset(seed=0)
+            answers.append(made.step(action))
+        (one, *numbers, info), (other, *_, again) = answers
+        info.pop("is_success", None)
+        arrays = {"": (one, other)} | {key: (info[key], again[key]) for key in info if np.ndim(info[key])}
+        assert not any(np.shares_memory(*pair) for pair in arrays.values())
+        told = {key: (pair[0].dtype, pair[0].shape) for key, pair in arrays.items()}
+        kinds.append((told, [type(n) for n in numbers], {key: type(value) for key, value in info.items()}))
+    assert kinds[0] == kinds[1]
+
+
+def test_kernels_without_python_play_what_the_env_plays() -> None:
+    given = script("control", env.CASES[env.BASE], 1, 20, 1)
+    ours: Any = gymnasium.make(ENV_ID, disable_env_checker=True, **vars(given.settings))
+    ours.reset(seed=0)
+    for action in given.actions[:, 0]:
+        _, _, terminated, truncated, info = ours.step(action)
+        assert not terminated
+        assert not truncated
+    played = floor.Kernels(given.settings, given.actions[:, 0])
+    for _ in range(2):
+        played.reset()
+        played.run()
+        np.testing.assert_array_equal(played.episodes.state.robots[0], info["robots"])
 
 
 def test_contestants_take_turns_and_the_first_is_for_warming_up() -> None:

@@ -82,20 +82,34 @@ def test_it_speaks_in_the_types_of_stable_baselines(venv: TwoRobotsVecEnv) -> No
     assert observations.dtype == np.float32
     assert observations.shape == (4, *venv.observation_space.shape)  # type: ignore[misc]
     rng = np.random.default_rng(1)
+    returned: list[tuple[NDArray[Any], NDArray[Any]]] = [(observations, observations.copy())]
+    ended = 0
     for _ in range(20):
-        kept = observations.copy()
-        before = observations
         actions = rng.uniform(-1, 1, (4, 6)).astype(np.float32)
+        given = actions.copy()
         observations, rewards, dones, infos = venv.step(actions)
-        np.testing.assert_array_equal(before, kept)
-        assert (observations.dtype, observations.shape) == (np.float32, kept.shape)
+        returned += [(array, array.copy()) for array in (observations, rewards, dones)]
+        returned += [(info[key], info[key].copy()) for info in infos for key in info if key == "terminal_observation"]
+        for array, kept in [*returned, (actions, given)]:
+            np.testing.assert_array_equal(array, kept)
+        assert (observations.dtype, observations.shape) == (np.float32, (4, *venv.observation_space.shape))  # type: ignore[misc]
         assert (rewards.dtype, rewards.shape) == (np.float32, (4,))
         assert (dones.dtype, dones.shape) == (np.bool_, (4,))
         assert isinstance(infos, list)
         assert all(venv.observation_space.contains(row) for row in observations)
         for done, info in zip(dones, infos, strict=True):
             assert bool(info) == done
-            assert not done or venv.observation_space.contains(info["terminal_observation"])
+            if done:
+                ended += 1
+                assert venv.observation_space.contains(info["terminal_observation"])
+                assert type(info["TimeLimit.truncated"]) is type(info["is_success"]) is bool
+                assert {key: type(value) for key, value in info["episode"].items()} == {
+                    "r": float,
+                    "l": int,
+                    "t": float,
+                }
+                assert all(type(info[key]) is float for key in EPISODE_KEYS)
+    assert ended
 
 
 def test_the_first_reset_begins_at_the_seed_and_later_ones_go_on() -> None:

@@ -1,0 +1,87 @@
+"""What a scalar step cannot go below: an environment that does nothing, and the laws of a step without Python."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numba
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from benchmarks.measure import Contestant
+from magenv.env import TwoRobots
+from magenv.episodes import Episodes, Settings
+from magenv.state import State
+from magenv.steps import begin_one, one_kernel
+
+Observation = NDArray[np.float32]
+
+
+class Nothing(gymnasium.Env[Any, Any]):
+    """Answers every step with constants of the kinds that ``TwoRobots`` answers with, its arrays copied."""
+
+    def __init__(self) -> None:
+        env = TwoRobots()
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        env.reset(seed=0)
+        observation, self._reward, _, _, info = env.step(np.zeros(env.action_space.shape or 0, np.float32))
+        info.pop("is_success", None)
+        arrays = (observation, *(info.pop(name) for name in ("robots", "reference", "epm_pose")))
+        self._observation, self._robots, self._reference, self._poses = (array.copy for array in arrays)
+        self._numbers = info
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Observation, dict[str, Any]]:
+        """Return the observation and no info."""
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Return what is always returned."""
+        info = {
+            **self._numbers,
+            "robots": self._robots(),
+            "reference": self._reference(),
+            "epm_pose": self._poses(),
+        }
+        return self._observation(), self._reward, False, False, info
+
+
+def nothing() -> gymnasium.Env[Any, Any]:
+    """Return ``Nothing`` as ``gymnasium.make`` makes it, in no more wrappers than ``TwoRobots`` is in."""
+    return gymnasium.make(
+        EnvSpec("Nothing-v0", entry_point="benchmarks.floor:Nothing", order_enforce=False), disable_env_checker=True
+    )
+
+
+class Kernels:
+    """One episode stepped with ``actions`` (k, size) in a compiled loop, and begun anew wherever it ends."""
+
+    def __init__(self, settings: Settings, actions: NDArray[Any]) -> None:
+        self.episodes = Episodes(1, settings)
+        self._actions = actions.astype(np.float64)
+        step, begin = one_kernel(settings.action, settings.n_epm), begin_one
+
+        def play(s: State, actions: NDArray[np.float64]) -> None:
+            for k in range(len(actions)):
+                s.action[0] = actions[k]
+                step(s)
+                if s.ended[0, 0] or s.ended[1, 0]:
+                    s.used[0] = 0  # the same start again
+                    begin(s)
+
+        self._play: Any = numba.njit(play)
+
+    def reset(self) -> None:
+        """Begin the episode of seed 0."""
+        self.episodes.seed(0, seeding.np_random(0)[0])
+        self.episodes.start(self.episodes.state.every)
+
+    def run(self) -> None:
+        """Step with all actions."""
+        self._play(self.episodes.packed, self._actions)
+
+    def contestant(self) -> Contestant:
+        """Return this loop as a contestant."""
+        return Contestant(self.run, len(self._actions), self.reset)
