@@ -97,7 +97,8 @@ def _scale_errors(target: Floats, force_scale_n: float, torque_scale_nm: float, 
 
 def _check_scales(force_scale_n: float, torque_scale_nm: float) -> None:
     for name, number in (("force_scale_n", force_scale_n), ("torque_scale_nm", torque_scale_nm)):
-        require(math.isfinite(number) and number > 0, name, "a positive, finite number", number)
+        fits = isinstance(number, (int, float, np.number)) and 1e-9 <= number <= 1e9
+        require(fits, name, "a number from 1e-9 to 1e9", number)
 
 
 def _limits(system: System) -> Floats:

@@ -261,7 +261,7 @@ def field(moment: ArrayLike, source: ArrayLike, point: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3)
-        B in T; NaN where point and source coincide.
+        B in T; NaN where point and source coincide, and from 1e145 m on.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def gradient(moment: ArrayLike, source: ArrayLike, point: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        ``[i, j]`` = dB_i/dp_j in T/m, symmetric and traceless; NaN where point and source coincide.
+        ``[i, j]`` = dB_i/dp_j in T/m, symmetric and traceless; NaN as `field` is.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def field_and_gradient(moment: ArrayLike, source: ArrayLike, point: ArrayLike) -
     field : ndarray, shape (..., 3)
         B in T, bit for bit that of `field`.
     gradient : ndarray, shape (..., 3, 3)
-        ``[i, j]`` = dB_i/dp_j in T/m, bit for bit that of `gradient`. Both are NaN where point and source coincide.
+        ``[i, j]`` = dB_i/dp_j in T/m, bit for bit that of `gradient`.
 
     Raises
     ------

@@ -6,6 +6,7 @@ generator before the first action, whatever the controller does.
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,9 +59,14 @@ def check_action(action: object, shape: tuple[int, ...]) -> Floats:
         If it has another shape or is not finite.
     """
     try:
-        numbers = np.array(action, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
-        raise InputError(f"Input action must be an array of shape {shape}; instead received {action!r}.") from None
+        given = np.asarray(action)
+        if given.dtype.kind not in "biufO":  # numpy would read text and dates as numbers
+            raise TypeError
+        numbers = np.array(given, dtype=np.float64, order="C")
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(
+            f"Input action must be an array of shape {shape}; instead received {reprlib.repr(action)}."
+        ) from None
     if numbers.shape != shape:
         require(False, "action", f"an array of shape {shape}", numbers.shape)
     if not clip(numbers.ravel()):

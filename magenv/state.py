@@ -36,7 +36,7 @@ class State(NamedTuple):
     epm_moment: Floats
     """(n,) A m^2"""
     coefficients: Floats
-    """(n or 1, 2, 32, 3, 4)"""
+    """(n or 1, 32, 2, 3, 4)"""
     duration: Floats
     """(n or 1,) s"""
     step: Integers

@@ -90,7 +90,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         require(fits, "seed", f"a whole number of at least 0, or {self.num_envs} of them", seed)
         mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
+            mask = np.array(options["reset_mask"])
             fits = mask.shape == (self.num_envs,) and mask.dtype == np.bool_ and bool(mask.any())
             require(fits, "reset_mask", f"{self.num_envs} booleans, one of them true", options["reset_mask"])
         for row in np.flatnonzero(mask).tolist():
@@ -161,6 +161,8 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='rgb_array' given to gymnasium.make_vec.")
             return None
+        if not self._begun.all():
+            raise ResetNeeded("No episodes have begun; call reset() before render().")
         if not self._renderers:
             for _ in range(self.num_envs):
                 self._renderers.append(Renderer(self._episodes.system, self._episodes.plant, window=False))

@@ -8,7 +8,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from rollouts import AUTORESETS, MakeEnv, N, Record, assert_same_bits, assert_same_info, info_of, vector
 
-from magenv.trajectories import draw
+from magenv.steps import begin_episodes
+from magenv.trajectories import approach, draw
 from magenv.vector_env import TwoRobotsVector
 
 
@@ -115,3 +116,25 @@ def test_end_of_the_reference_truncates_every_row(stuck_plant: str, control_hz: 
     assert info["final_info"]["is_success"].all()
     np.testing.assert_allclose(info["final_info"]["time_s"], 100.0)
     np.testing.assert_array_equal(info["time_s"], 0.0)
+
+
+def test_rows_out_of_step_are_told_the_references_of_their_own_times() -> None:
+    env = vector(autoreset=AutoresetMode.DISABLED, scenario="approach-60", control_hz=10.0)
+    env.reset(seed=0)
+    still = np.zeros((N, 10), np.float32)
+    env.step(still)
+    env.reset(options={"reset_mask": np.arange(N) == 1})
+    _, _, _, _, info = env.step(still)
+    assert info["time_s"][0] > info["time_s"][1]
+    for time, reference in zip(info["time_s"], info["reference"], strict=True):
+        np.testing.assert_allclose(reference, approach(0.060).at(time), rtol=0, atol=1e-15)
+
+
+def test_a_mask_need_not_lie_in_one_piece() -> None:
+    env = vector(autoreset=AutoresetMode.DISABLED, scenario="approach-60")
+    env.reset(seed=0)
+    signatures = len(begin_episodes.signatures)
+    strided = np.ones(2 * N, np.bool_)[::2]
+    strided.flags.writeable = False
+    env.reset(options={"reset_mask": strided})
+    assert len(begin_episodes.signatures) == signatures, "compiled anew"

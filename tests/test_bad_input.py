@@ -132,7 +132,11 @@ def test_message_of_a_long_action_is_one_line() -> None:
     assert len(message) < 300
 
 
-@pytest.mark.parametrize("action", ["forward", None, [[1, 2], [3]]])
+@pytest.mark.parametrize(
+    "action",
+    ["forward", None, [[1, 2], [3]], ["0.1"] * 10, [10**400] * 10, [1j] * 10, np.zeros(10, "datetime64[s]")],
+    ids=["text", "nothing", "ragged", "texts", "huge", "complex", "dates"],
+)
 def test_action_that_is_no_array_of_numbers(make_env: MakeEnv, action: Any) -> None:
     env = make_env()
     env.reset(seed=0)

@@ -195,6 +195,8 @@ def problem(**changes: Any) -> dict[str, Any]:
         ({"method": "magic"}, "method"),
         ({"force_scale_n": 0.0}, "force_scale_n"),
         ({"torque_scale_nm": -1.0}, "torque_scale_nm"),
+        ({"force_scale_n": 1e-300}, "force_scale_n"),
+        ({"torque_scale_nm": "a"}, "torque_scale_nm"),
     ],
     ids=lambda v: v if isinstance(v, str) else "-".join(f"{k}={np.shape(x) or x}" for k, x in v.items()),
 )

@@ -9,10 +9,12 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 import magenv
 from magenv.episodes import Episodes, Settings
 from magenv.scene import scene_of
+from magenv.vector_env import TwoRobotsVector
 
 pytestmark = pytest.mark.usefixtures("no_display")
 
@@ -103,3 +105,9 @@ def test_importing_the_environment_imports_no_plotting_library() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=dict(os.environ))
     assert run.stdout.splitlines() == ["[]", "['pygame']"]
+
+
+def test_the_batch_is_not_drawn_before_it_has_begun() -> None:
+    env = TwoRobotsVector(2, render_mode="rgb_array")
+    with pytest.raises(ResetNeeded, match=r"call reset\(\)"):
+        env.render()
