@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.arithmetic import dot3, fma, inverse_root
+from magenv.arithmetic import dot2, dot3, fma, inverse_root
 from magenv.kernels import kernel, law
 from magenv.params import MU_0, require
 
@@ -72,20 +72,22 @@ def dipole_gradient(
 ) -> tuple[float, float, float, float, float, float]:
     """Return the gradient's (xx, xy, xz, yy, yz, zz) in T/m.
 
-    3 k / |r|^4 (m r^T + r m^T + (m.r)(I - 5 r r^T)) with r the unit vector: symmetric, traceless.
+    3 k / |r|^4 (m r^T + r m^T + (m.r)(I - 5 r r^T)) with r the unit vector: symmetric, traceless. It is computed as
+    v r^T + r v^T + (m.r) I with v = m - 5/2 (m.r) r.
     """
-    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
-    m_r = mx * rx + my * ry + mz * rz
-    five = 5.0 * m_r * inverse_r2
+    m_r = dot3(mx, my, mz, rx, ry, rz)
+    on_r = -2.5 * (m_r * inverse_r2)
+    vx, vy, vz = fma(on_r, rx, mx), fma(on_r, ry, my), fma(on_r, rz, mz)
     return (
-        k * (2.0 * mx * rx + m_r - five * rx * rx),
-        k * (mx * ry + my * rx - five * rx * ry),
-        k * (mx * rz + mz * rx - five * rx * rz),
-        k * (2.0 * my * ry + m_r - five * ry * ry),
-        k * (my * rz + mz * ry - five * ry * rz),
-        k * (2.0 * mz * rz + m_r - five * rz * rz),
+        k * fma(2.0 * vx, rx, m_r),
+        k * dot2(vx, vy, ry, rx),
+        k * dot2(vx, vz, rz, rx),
+        k * fma(2.0 * vy, ry, m_r),
+        k * dot2(vy, vz, rz, ry),
+        k * fma(2.0 * vz, rz, m_r),
     )
 
 
@@ -97,12 +99,12 @@ def dipole_force_gradient(
 
     It is the second derivative of B contracted with n: d^2 B_k / dp_i dp_j n_k, symmetric and traceless.
     """
-    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
-    m_n = mx * nx + my * ny + mz * nz
-    m_r = mx * rx + my * ry + mz * rz
-    n_r = nx * rx + ny * ry + nz * rz
+    m_n = dot3(mx, my, mz, nx, ny, nz)
+    m_r = dot3(mx, my, mz, rx, ry, rz)
+    n_r = dot3(nx, ny, nz, rx, ry, rz)
     five = 5.0 * inverse_r2
     diagonal = m_n - five * m_r * n_r
     # The remaining terms are a sym(m n) + sym(r, v) with v collecting what multiplies r.
@@ -141,7 +143,7 @@ def dipole_force_hessian(
     -945 k / |r|^6 (r^5 - 1/9 sum_10 I r^3 + 1/63 sum_15 I I r) contracted with a, b and c, k = mu0 / (4 pi): the fifth
     derivative of 1/|r|, symmetric in a, b, c and in i, j, traceless.
     """
-    inverse_r = inverse_root(rx * rx + ry * ry + rz * rz)
+    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = -15.0 * _K * inverse_r2 * inverse_r2 * inverse_r2 * inverse_r
     a_r, b_r, c_r = ax * rx + ay * ry + az * rz, bx * rx + by * ry + bz * rz, cx * rx + cy * ry + cz * rz
