@@ -17,8 +17,8 @@ from magenv.dipole import dipole_field, dipole_gradient, field, field_and_gradie
 TITLE = "Dipole"
 
 FLOPS = 61
-"""Floating point operations of field and gradient of one pair by the common formulas, a division and a square root among
-them: the measure of the work, however it is done."""
+"""Floating point operations of field and gradient of one pair by the common formulas, a division and a square root
+among them: the measure of the work, however it is done."""
 BYTES = 8 * (3 + 3 + 3 + 9)
 """What field and gradient of one pair read (moment, point; all have one source) and write."""
 CALLS = 20
