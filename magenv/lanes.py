@@ -29,7 +29,8 @@ SEGMENT_RATE, SEGMENT, PROGRESS = 25, 26, 27
 COEFFICIENTS = 28
 COEFFICIENTS_SIZE = 24
 
-# What is measured, in the order of ``world.Measurements.numbers``; the first two are sums until the hold ends.
+# What is measured, in the order of ``world.Measurements.numbers``; until the hold ends the first two are sums and the
+# separations squared.
 MEASURED = 52
 POSITION_ERROR, HEADING_ERROR, POSITION_END, HEADING_END, SEPARATION_MIN, SEPARATION_TRACKED = range(52, 58)
 MEASURED_SIZE = 6
