@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.arithmetic import dot2, dot3, fma, inverse_root
+from magenv.arithmetic import dot2, dot3, fma
 from magenv.kernels import kernel, law
 from magenv.params import MU_0, require
 
@@ -28,25 +28,32 @@ Floats = NDArray[np.float64]
 _K = MU_0 / (4 * math.pi)
 
 
-@law
-def dipole_strengths(r2: float, m_r: float, n_r: float, m_n: float) -> tuple[float, float, float, float]:
-    """Return what the products |r|^2, m.r, n.r and m.n make of the field and the force of m on n at r.
+SOURCE = 3.0 * _K
+"""Strength s = 3 mu0 / (4 pi) m of a source per its moment m: what its field and force are computed of."""
 
-    (k, a, l, b) of B = k (a r - m) and F = l ((m.r) n + (n.r) m + b r), with r = position of n - position of m: with
-    k = mu0 / (4 pi |r|^3), a = 3 (m.r) / |r|^2, l = 3 k / |r|^2, b = m.n - 5 (m.r) (n.r) / |r|^2.
+
+@law
+def dipole_parts(r2: float, s_r: float, n_r: float, s_n: float) -> tuple[float, float, float, float]:
+    """Return what the products |r|^2, s.r, n.r and s.n make of the field and the force of a source s on n at r.
+
+    (k, a, g, e) of B = k s + a r and F = a n + g s + e r, with r = position of n - position of s and s the source's
+    moment times ``SOURCE``: k = -1 / (3 |r|^3), a = (s.r) / |r|^5, g = (n.r) / |r|^5 and
+    e = (s.n - 5 (s.r) (n.r) / |r|^2) / |r|^5.
     """
-    inverse_r = inverse_root(r2)
+    inverse_r = 1.0 / math.sqrt(r2)
     inverse_r2 = inverse_r * inverse_r
-    k = _K * inverse_r * inverse_r2
-    along = m_r * inverse_r2
-    return k, 3.0 * along, 3.0 * inverse_r2 * k, fma(-5.0 * along, n_r, m_n)
+    inverse_r3 = inverse_r * inverse_r2
+    inverse_r5 = inverse_r3 * inverse_r2
+    on_n, on_s = inverse_r5 * s_r, inverse_r5 * n_r
+    return (-1.0 / 3.0) * inverse_r3, on_n, on_s, fma(-5.0 * on_s, inverse_r2 * s_r, inverse_r5 * s_n)
 
 
 @law
 def dipole_field(mx: float, my: float, mz: float, rx: float, ry: float, rz: float) -> tuple[float, float, float]:
     """Return B (T) of the moment m (A m^2) at r = point - source (m): k (3 (m.r^) r^ - m) / |r|^3."""
-    k, along, _, _ = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), dot3(mx, my, mz, rx, ry, rz), 0.0, 0.0)
-    return k * fma(along, rx, -mx), k * fma(along, ry, -my), k * fma(along, rz, -mz)
+    sx, sy, sz = SOURCE * mx, SOURCE * my, SOURCE * mz
+    on_s, on_r, _, _ = dipole_parts(dot3(rx, ry, rz, rx, ry, rz), dot3(sx, sy, sz, rx, ry, rz), 0.0, 0.0)
+    return dot2(on_r, on_s, rx, sx), dot2(on_r, on_s, ry, sy), dot2(on_r, on_s, rz, sz)
 
 
 @law
@@ -57,12 +64,13 @@ def dipole_force(
 
     3 k / |r|^4 ((m.r) n + (n.r) m + (m.n - 5 (m.r) (n.r)) r) with r the unit vector.
     """
-    m_r, n_r = dot3(mx, my, mz, rx, ry, rz), dot3(nx, ny, nz, rx, ry, rz)
-    _, _, k, on_r = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), m_r, n_r, dot3(mx, my, mz, nx, ny, nz))
+    sx, sy, sz = SOURCE * mx, SOURCE * my, SOURCE * mz
+    s_r, n_r = dot3(sx, sy, sz, rx, ry, rz), dot3(nx, ny, nz, rx, ry, rz)
+    _, on_n, on_s, on_r = dipole_parts(dot3(rx, ry, rz, rx, ry, rz), s_r, n_r, dot3(sx, sy, sz, nx, ny, nz))
     return (
-        k * dot3(m_r, n_r, on_r, nx, mx, rx),
-        k * dot3(m_r, n_r, on_r, ny, my, ry),
-        k * dot3(m_r, n_r, on_r, nz, mz, rz),
+        dot3(on_n, on_s, on_r, nx, sx, rx),
+        dot3(on_n, on_s, on_r, ny, sy, ry),
+        dot3(on_n, on_s, on_r, nz, sz, rz),
     )
 
 
@@ -75,7 +83,7 @@ def dipole_gradient(
     3 k / |r|^4 (m r^T + r m^T + (m.r)(I - 5 r r^T)) with r the unit vector: symmetric, traceless. It is computed as
     v r^T + r v^T + (m.r) I with v = m - 5/2 (m.r) r.
     """
-    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
+    inverse_r = 1.0 / math.sqrt(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
     m_r = dot3(mx, my, mz, rx, ry, rz)
@@ -99,7 +107,7 @@ def dipole_force_gradient(
 
     It is the second derivative of B contracted with n: d^2 B_k / dp_i dp_j n_k, symmetric and traceless.
     """
-    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
+    inverse_r = 1.0 / math.sqrt(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = 3.0 * _K * inverse_r2 * inverse_r2 * inverse_r
     m_n = dot3(mx, my, mz, nx, ny, nz)
@@ -143,7 +151,7 @@ def dipole_force_hessian(
     -945 k / |r|^6 (r^5 - 1/9 sum_10 I r^3 + 1/63 sum_15 I I r) contracted with a, b and c, k = mu0 / (4 pi): the fifth
     derivative of 1/|r|, symmetric in a, b, c and in i, j, traceless.
     """
-    inverse_r = inverse_root(dot3(rx, ry, rz, rx, ry, rz))
+    inverse_r = 1.0 / math.sqrt(dot3(rx, ry, rz, rx, ry, rz))
     inverse_r2 = inverse_r * inverse_r
     k = -15.0 * _K * inverse_r2 * inverse_r2 * inverse_r2 * inverse_r
     a_r, b_r, c_r = ax * rx + ay * ry + az * rz, bx * rx + by * ry + bz * rz, cx * rx + cy * ry + cz * rz
@@ -263,7 +271,7 @@ def field(moment: ArrayLike, source: ArrayLike, point: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3)
-        B in T; NaN where point and source coincide, and from 1e145 m on.
+        B in T; NaN where point and source coincide.
 
     Raises
     ------

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos
 from magenv.arithmetic import cross2, dot2, fma
+from magenv.dipole import SOURCE
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     DECAY1,
@@ -42,7 +43,7 @@ from magenv.lanes import (
 )
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE
-from magenv.wrench import add_planar_wrench
+from magenv.wrench import add_source, planar_wrench
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +90,7 @@ class Physics(NamedTuple):
 
 
 @law
-def planar_wrench(
+def robots_wrench(
     lanes: Floats, i: int, n_epm: int, x1: float, y1: float, heading1: float, x2: float, y2: float, heading2: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return F_x, F_y (N) and tau_z (N m) on both robots of lane ``i`` at these poses, global frame.
@@ -101,16 +102,30 @@ def planar_wrench(
     m1x, m1y = lanes[MOMENT1, i] * c, lanes[MOMENT1, i] * s
     s, c = sincos(heading2)
     m2x, m2y = lanes[MOMENT2, i] * c, lanes[MOMENT2, i] * s
+    none = (0.0, 0.0, 0.0, 0.0, 0.0)
     dx, dy = x2 - x1, y2 - y1
-    f2x, f2y, tz2 = add_planar_wrench(0.0, 0.0, 0.0, m1x, m1y, 0.0, m2x, m2y, dx, dy, 0.0)
-    f1x, f1y, tz1 = -f2x, -f2y, -cross2(dx, dy, f2x, f2y) - tz2
+    mutual = add_source(none, SOURCE * m1x, SOURCE * m1y, 0.0, m2x, m2y, dx, dy, 0.0)
+    fx, fy, turn = planar_wrench(mutual, m2x, m2y)
+    on1, on2 = none, none
     for k in range(n_epm):
         e = EPMS + EPM_SIZE * k
-        ex, ey, ez = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
-        mx, my, mz = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
-        f1x, f1y, tz1 = add_planar_wrench(f1x, f1y, tz1, mx, my, mz, m1x, m1y, x1 - ex, y1 - ey, -ez)
-        f2x, f2y, tz2 = add_planar_wrench(f2x, f2y, tz2, mx, my, mz, m2x, m2y, x2 - ex, y2 - ey, -ez)
-    return f1x, f1y, tz1, f2x, f2y, tz2
+        ex, ey, z2 = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
+        sx, sy, s_z = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
+        on1 = add_source(on1, sx, sy, s_z, m1x, m1y, x1 - ex, y1 - ey, z2)
+        on2 = add_source(on2, sx, sy, s_z, m2x, m2y, x2 - ex, y2 - ey, z2)
+    f1x, f1y, tz1 = planar_wrench(on1, m1x, m1y)
+    f2x, f2y, tz2 = planar_wrench(on2, m2x, m2y)
+    return f1x - fx, f1y - fy, tz1 - (cross2(dx, dy, fx, fy) + turn), f2x + fx, f2y + fy, tz2 + turn
+
+
+@law
+def place_epm(
+    lanes: Floats, i: int, k: int, moment: float, x: float, y: float, z: float, ux: float, uy: float, uz: float
+) -> None:
+    """Put EPM ``k``, its moment (A m^2) along the unit vector u, into lane ``i``: what ``add_source`` needs of it."""
+    e, strength = EPMS + EPM_SIZE * k, SOURCE * moment
+    lanes[e, i], lanes[e + 1, i], lanes[e + 2, i] = x, y, z * z
+    lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i] = strength * ux, strength * uy, -strength * uz * z
 
 
 @kernel
@@ -123,14 +138,13 @@ def _drag(drag: float, inertia: float, h: float) -> tuple[float, float]:
 def constants(physics: Physics, h: float, out: Floats) -> None:
     """Write what a substep of ``h`` (s) needs of the physics into ``out`` (n, 10), in the order of ``lanes``.
 
-    Per robot decay and gain of v(t + h) = decay v + gain F, linear and turning: exact for constant force F under
-    viscous drag. Then the moments of both robots (A m^2).
+    Decay and gain of v(t + h) = decay v + gain F, linear and turning: exact for constant force F under viscous drag.
+    Then the moments (A m^2). Of each there are two, one a robot.
     """
     for row in range(len(out)):
         for robot in range(2):
-            at = 4 * robot
-            out[row, at], out[row, at + 1] = _drag(physics.drag_linear[row, robot], physics.mass[row, robot], h)
-            out[row, at + 2], out[row, at + 3] = _drag(
+            out[row, robot], out[row, 2 + robot] = _drag(physics.drag_linear[row, robot], physics.mass[row, robot], h)
+            out[row, 4 + robot], out[row, 6 + robot] = _drag(
                 physics.drag_rotational[row, robot], physics.inertia[row, robot], h
             )
             out[row, 8 + robot] = physics.ipm_moment[row, robot]
@@ -193,7 +207,7 @@ def advance(lanes: Floats, i: int, n_epm: int, h: float) -> None:
     vx2, vy2, rate2 = lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i]
     x1, y1, heading1 = fma(half, vx1, lanes[X1, i]), fma(half, vy1, lanes[Y1, i]), fma(half, rate1, lanes[HEADING1, i])
     x2, y2, heading2 = fma(half, vx2, lanes[X2, i]), fma(half, vy2, lanes[Y2, i]), fma(half, rate2, lanes[HEADING2, i])
-    f1x, f1y, tz1, f2x, f2y, tz2 = planar_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
+    f1x, f1y, tz1, f2x, f2y, tz2 = robots_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
     # v = decay v + gain F
     vx1, vy1 = dot2(lanes[DECAY1, i], lanes[GAIN1, i], vx1, f1x), dot2(lanes[DECAY1, i], lanes[GAIN1, i], vy1, f1y)
     vx2, vy2 = dot2(lanes[DECAY2, i], lanes[GAIN2, i], vx2, f2x), dot2(lanes[DECAY2, i], lanes[GAIN2, i], vy2, f2y)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import wrap
 from magenv.arithmetic import dot2
-from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
+from magenv.dynamics import TOUCH, WALL, advance, may_touch, place_epm, resolve_contact
 from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
@@ -23,7 +23,6 @@ from magenv.lanes import (
     CONSTANTS_SIZE,
     CONTACT,
     DONE,
-    EPMS,
     HEADING1,
     HEADING2,
     HEADING_END,
@@ -61,15 +60,16 @@ def _load_segment(lanes: Floats, i: int, position: float, coefficients: Floats) 
     """Put the coefficients (32, 2, 3, 4) of the segment at ``position`` into lane ``i``."""
     segment = min(int(position), SEGMENTS - 1) if position >= 0.0 else 0
     lanes[SEGMENT, i] = segment
-    for j in range(24):
-        lanes[COEFFICIENTS + j, i] = coefficients[segment, j // 12, (j // 4) % 3, j % 4]
+    for robot in range(2):
+        for j in range(12):
+            lanes[COEFFICIENTS + 2 * j + robot, i] = coefficients[segment, robot, j // 4, j % 4]
 
 
 @law
-def _reference(lanes: Floats, i: int, j: int) -> float:
-    """Return the ``j``-th coordinate of the reference: x, y, heading of robot 1, then of robot 2."""
-    c = COEFFICIENTS + 4 * j
-    return cubic(lanes[c, i], lanes[c + 1, i], lanes[c + 2, i], lanes[c + 3, i], lanes[PROGRESS, i])
+def _reference(lanes: Floats, i: int, robot: int, axis: int) -> float:
+    """Return a coordinate of the reference: x, y or heading of a robot."""
+    c = COEFFICIENTS + 8 * axis + robot
+    return cubic(lanes[c, i], lanes[c + 2, i], lanes[c + 4, i], lanes[c + 6, i], lanes[PROGRESS, i])
 
 
 @law
@@ -86,13 +86,13 @@ def _count(lanes: Floats, i: int, h: float) -> bool:
 def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, tracking_distance: float) -> bool:
     """Add lane ``i`` at a substep's end to its measurements; return whether its hold is over."""
     x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
-    dx, dy = x1 - _reference(lanes, i, 0), y1 - _reference(lanes, i, 1)
+    dx, dy = x1 - _reference(lanes, i, 0, 0), y1 - _reference(lanes, i, 0, 1)
     first = math.sqrt(dot2(dx, dy, dx, dy))
-    dx, dy = x2 - _reference(lanes, i, 3), y2 - _reference(lanes, i, 4)
+    dx, dy = x2 - _reference(lanes, i, 1, 0), y2 - _reference(lanes, i, 1, 1)
     second = math.sqrt(dot2(dx, dy, dx, dy))
     position_error = 0.5 * (first + second)
-    turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, 2)))
-    turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, 5)))
+    turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, 0, 2)))
+    turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, 1, 2)))
     heading_error = 0.5 * (turned1 + turned2)
     separation = dot2(x2 - x1, y2 - y1, x2 - x1, y2 - y1)  # squared: the root is drawn once, at the end
     lanes[POSITION_ERROR, i] += position_error
@@ -111,10 +111,10 @@ def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, track
 def _touch(lanes: Floats, i: int, bodies: Floats, mass: Floats, diameter: float, wall_radius: float) -> None:
     """Resolve contact in lane ``i``; ``bodies`` (2, 6) is scratch."""
     for j in range(2 * STATE_SIZE):
-        bodies[j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
+        bodies[j % 2, j // 2] = lanes[X1 + j, i]
     lanes[CONTACT, i] = resolve_contact(bodies, mass, diameter, wall_radius)
     for j in range(2 * STATE_SIZE):
-        lanes[X1 + j, i] = bodies[j // STATE_SIZE, j % STATE_SIZE]
+        lanes[X1 + j, i] = bodies[j % 2, j // 2]
 
 
 @law
@@ -124,8 +124,8 @@ def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
         return _TOUCH
     if contact & WALL:
         return _WALL
-    dx1, dy1 = lanes[X1, i] - _reference(lanes, i, 0), lanes[Y1, i] - _reference(lanes, i, 1)
-    dx2, dy2 = lanes[X2, i] - _reference(lanes, i, 3), lanes[Y2, i] - _reference(lanes, i, 4)
+    dx1, dy1 = lanes[X1, i] - _reference(lanes, i, 0, 0), lanes[Y1, i] - _reference(lanes, i, 0, 1)
+    dx2, dy2 = lanes[X2, i] - _reference(lanes, i, 1, 0), lanes[Y2, i] - _reference(lanes, i, 1, 1)
     first, second = math.sqrt(dot2(dx1, dy1, dx1, dy1)), math.sqrt(dot2(dx2, dy2, dx2, dy2))
     return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
 
@@ -178,7 +178,7 @@ def hold_rows(
                     rows[i] = row
                     busy += 1
                     for j in range(2 * STATE_SIZE):
-                        lanes[X1 + j, i] = robots[row, j // STATE_SIZE, j % STATE_SIZE]
+                        lanes[X1 + j, i] = robots[row, j % 2, j // 2]
                     for j in range(CONSTANTS_SIZE):
                         lanes[CONSTANTS + j, i] = constants[row, j]
                     # The EPMs jump, as in the paper. Slower ones would travel in the loop over substeps, before
@@ -186,8 +186,15 @@ def hold_rows(
                     for k in range(n_epm):
                         for j in range(EPM_SIZE):
                             epms[row, k, j] = targets[row, k, j]
-                            unit = epm_moment[row] if j >= 3 else 1.0
-                            lanes[EPMS + EPM_SIZE * k + j, i] = unit * targets[row, k, j]
+                        x, y, z, ux, uy, uz = (
+                            targets[row, k, 0],
+                            targets[row, k, 1],
+                            targets[row, k, 2],
+                            targets[row, k, 3],
+                            targets[row, k, 4],
+                            targets[row, k, 5],
+                        )
+                        place_epm(lanes, i, k, epm_moment[row], x, y, z, ux, uy, uz)
                     which = trajectory_of(row, len(duration))
                     lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
                     lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
@@ -220,7 +227,7 @@ def hold_rows(
                 row = rows[i]
                 if flagged[i]:
                     for j in range(2 * STATE_SIZE):
-                        robots[row, j // STATE_SIZE, j % STATE_SIZE] = lanes[X1 + j, i]
+                        robots[row, j % 2, j // 2] = lanes[X1 + j, i]
                     for j in range(MEASURED_SIZE):
                         numbers[j, row] = lanes[MEASURED + j, i]
                     numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]

@@ -11,20 +11,18 @@ from magenv.poses import EPM_SIZE
 
 STATE_SIZE = 6
 """Numbers of a robot's state: x, y, heading, v_x, v_y, rate."""
-X1, Y1, HEADING1, VX1, VY1, RATE1 = range(6)
-X2, Y2, HEADING2, VX2, VY2, RATE2 = range(6, 12)
+# Both robots' values stand side by side, so that in a single lane one vector holds the two.
+X1, X2, Y1, Y2, HEADING1, HEADING2, VX1, VX2, VY1, VY2, RATE1, RATE2 = range(12)
 
-# Constants of an episode, in the order of ``dynamics.constants``: (decay, gain) of translation and rotation, moments.
+# Constants of an episode, in the order of ``dynamics.constants``: decay and gain of translation and rotation, moments.
 CONSTANTS = 12
-DECAY1, GAIN1, TURN_DECAY1, TURN_GAIN1 = range(12, 16)
-DECAY2, GAIN2, TURN_DECAY2, TURN_GAIN2 = range(16, 20)
-MOMENT1, MOMENT2 = 20, 21
+DECAY1, DECAY2, GAIN1, GAIN2, TURN_DECAY1, TURN_DECAY2, TURN_GAIN1, TURN_GAIN2, MOMENT1, MOMENT2 = range(12, 22)
 CONSTANTS_SIZE = 10
 
 # The hold: its beginning (s), substeps done, contact flags found.
 START, DONE, CONTACT = 22, 23, 24
 
-# The reference: segments per second, present segment, position in it, its coefficients (2 robots, 3 axes, 4 powers).
+# The reference: segments per second, present segment, position in it, its coefficients (3 axes, 4 powers, 2 robots).
 SEGMENT_RATE, SEGMENT, PROGRESS = 25, 26, 27
 COEFFICIENTS = 28
 COEFFICIENTS_SIZE = 24
@@ -36,7 +34,7 @@ POSITION_ERROR, HEADING_ERROR, POSITION_END, HEADING_END, SEPARATION_MIN, SEPARA
 MEASURED_SIZE = 6
 
 EPMS = 58
-"""First field of the EPMs: centre (m) and moment (A m^2) of each."""
+"""First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
 
 
 @law

@@ -76,6 +76,7 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         self._begun: Bools = np.zeros(num_envs, np.bool_)
         self._ended: Bools = np.ones(num_envs, np.bool_)
         self._renderers: list[Renderer] = []
+        _keep_memory(_STEP_BYTES * num_envs)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -135,12 +136,12 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
 
     def _same_step(self, info: dict[str, Any], ended: Bools, observations: Observations) -> dict[str, Any]:
         """Begin the ended episodes anew; return the info of the others, with the end of these beside it."""
+        last = observations[ended]
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for row, last in zip(np.flatnonzero(ended).tolist(), observations[ended], strict=True):
-            final_obs[row] = last
+        final_obs[ended] = np.fromiter(last, object, len(last))  # a row each
         values = {name: value for name, value in info.items() if not name.startswith("_")}
-        final = _masked({name: value.copy() for name, value in values.items()} | self._episodes.state_info(), ended)
-        values.pop("is_success")
+        success = {"is_success": values.pop("is_success")}
+        final = _masked(self._episodes.step_info() | success | self._episodes.state_info(), ended)
         self._start(ended, observations)
         return (
             _masked(values, ~ended)
@@ -178,6 +179,19 @@ class TwoRobotsVector(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
         for renderer in self._renderers:
             renderer.close()
         self._renderers = []
+
+
+_STEP_BYTES = 4096
+"""About what a step allocates for an episode: observations and infos, those of its end beside those of its start."""
+
+
+def _keep_memory(size: int) -> None:
+    """Let the C library keep this much (bytes) for the arrays to come when those of earlier steps are freed.
+
+    glibc returns what is free beyond twice the largest block that was ever freed to the system, up to 32 MB; to get it
+    back page by page at every step would take longer than to write it.
+    """
+    np.empty(min(size, 30_000_000), np.uint8)
 
 
 def _masked(values: dict[str, NDArray[Any]], mask: Bools) -> dict[str, Any]:

@@ -11,14 +11,14 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.arithmetic import cross2, dot2, dot3, fma
+from magenv.arithmetic import cross2, dot2, fma
 from magenv.dipole import (
     dipole_field,
     dipole_force,
     dipole_force_gradient,
     dipole_force_hessian,
     dipole_gradient,
-    dipole_strengths,
+    dipole_parts,
 )
 from magenv.kernels import kernel, law
 from magenv.params import common_shape, require
@@ -43,28 +43,44 @@ def dipole_wrench(
     return my * bz - mz * by, mz * bx - mx * bz, mx * by - my * bx, fx, fy, fz
 
 
+PlanarSums = tuple[float, float, float, float, float]
+"""What sources do to a robot in the plane: B_x, B_y (T), force per moment along it (T/m), F_x, F_y of the rest (N)."""
+
+
 @law
-def add_planar_wrench(
-    fx: float,
-    fy: float,
-    tz: float,
+def add_source(
+    sums: PlanarSums,
     sx: float,
     sy: float,
-    sz: float,
-    mx: float,
-    my: float,
+    s_z: float,
+    nx: float,
+    ny: float,
     rx: float,
     ry: float,
-    rz: float,
-) -> tuple[float, float, float]:
-    """Return F_x, F_y (N) and tau_z (N m) with those of ``dipole_wrench`` added, for a moment m in the plane."""
-    s_r, m_r = dot3(sx, sy, sz, rx, ry, rz), dot2(mx, my, rx, ry)
-    k_field, along, k_force, on_r = dipole_strengths(dot3(rx, ry, rz, rx, ry, rz), s_r, m_r, dot2(sx, sy, mx, my))
+    z2: float,
+) -> PlanarSums:
+    """Return the sums with a source's share added, for a moment n in the plane at the offset (rx, ry) in the plane.
+
+    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``z2`` is the square of the source's height
+    z and ``s_z`` is minus the product of its strength's z component and z: all that enters of what is out of the plane.
+    """
+    bx, by, along, fx, fy = sums
+    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, z2)), fma(sx, rx, fma(sy, ry, s_z)), dot2(nx, ny, rx, ry)
+    k, on_n, on_s, on_r = dipole_parts(r2, s_r, n_r, dot2(sx, sy, nx, ny))
     return (
-        fma(k_force, dot3(s_r, m_r, on_r, mx, sx, rx), fx),
-        fma(k_force, dot3(s_r, m_r, on_r, my, sy, ry), fy),
-        fma(k_field, cross2(mx, my, fma(along, rx, -sx), fma(along, ry, -sy)), tz),
+        fma(on_n, rx, fma(k, sx, bx)),
+        fma(on_n, ry, fma(k, sy, by)),
+        along + on_n,
+        fma(on_r, rx, fma(on_s, sx, fx)),
+        fma(on_r, ry, fma(on_s, sy, fy)),
     )
+
+
+@law
+def planar_wrench(sums: PlanarSums, nx: float, ny: float) -> tuple[float, float, float]:
+    """Return F_x, F_y (N) and tau_z (N m) of the sources summed up, on the moment n in the plane."""
+    bx, by, along, fx, fy = sums
+    return fma(along, nx, fx), fma(along, ny, fy), cross2(nx, ny, bx, by)
 
 
 @kernel

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.dynamics import Physics, advance, constants, may_touch
-from magenv.lanes import CONSTANTS, CONSTANTS_SIZE, EPMS, fields
+from magenv.dynamics import Physics, advance, constants, may_touch, place_epm
+from magenv.lanes import CONSTANTS, CONSTANTS_SIZE, fields
 from magenv.params import Plant, System
 from magenv.poses import pose_bounds, project, to_cartesian
 
@@ -25,9 +25,10 @@ def one_lane(robots: Floats, epms: Floats, physics: Physics, h: float) -> Floats
     """A single lane (fields, 1) with these robots (2, 6) and EPMs (N, 6)."""
     lane, row = np.zeros((fields(len(epms)), 1)), np.empty((1, CONSTANTS_SIZE))
     constants(physics, h, row)
-    lane[:12, 0] = robots.reshape(-1)
+    lane[:12, 0] = robots.T.reshape(-1)  # both robots' x, then both y, ...
     lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row
-    lane[EPMS:, 0] = (epms * ([1.0] * 3 + [physics.epm_moment[0]] * 3)).reshape(-1)
+    for k, epm in enumerate(epms):
+        place_epm(lane, 0, k, physics.epm_moment[0], *epm)
     return lane
 
 
@@ -38,5 +39,5 @@ def run(robots: Floats, epms: Floats, plant: Plant, h: float, steps: int, system
     for _ in range(steps):
         advance(lane, 0, len(epms), h)
         assert not may_touch(lane, 0, plant.body.diameter_m, plant.workspace_radius_m)
-        path.append(lane[:12, 0].reshape(2, 6).copy())
+        path.append(lane[:12, 0].reshape(6, 2).T.copy())
     return np.array(path)

@@ -87,10 +87,10 @@ def test_attracted_robots_never_pass_through_each_other(rng: np.random.Generator
         for _ in range(400):
             advance(lane, 0, 0, h)
             near = may_touch(lane, 0, DIAMETER, plant.workspace_radius_m)
-            state = lane[:12, 0].reshape(2, 6).copy()
+            state = lane[:12, 0].reshape(6, 2).T.copy()
             contact = resolve_contact(state, physics.mass[0], DIAMETER, plant.workspace_radius_m)
             assert near or not contact
-            lane[:12, 0] = state.reshape(-1)
+            lane[:12, 0] = state.T.reshape(-1)
             flags |= contact
             assert state[1, 0] - state[0, 0] >= DIAMETER - 1e-12
         assert flags == TOUCH

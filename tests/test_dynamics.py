@@ -11,7 +11,7 @@ from lane import SYSTEM, magnets, one_lane, run
 from numpy.typing import NDArray
 
 from magenv.dipole import field
-from magenv.dynamics import Physics, planar_wrench
+from magenv.dynamics import Physics, robots_wrench
 from magenv.params import Body, Plant, System
 from magenv.poses import from_cartesian
 from magenv.wrench import planar_moments, robot_wrench
@@ -39,7 +39,7 @@ def wrenches(robots: Floats, epms: Floats, system: System, ipm_moment: Floats | 
     if ipm_moment is not None:
         physics.ipm_moment[0] = ipm_moment
     lane = one_lane(robots, epms, physics, 0.005)
-    return np.array(planar_wrench(lane, 0, len(epms), *robots[0, :3], *robots[1, :3])).reshape(2, 3)
+    return np.array(robots_wrench(lane, 0, len(epms), *robots[0, :3], *robots[1, :3])).reshape(2, 3)
 
 
 def energy(robots: Floats, epms: Floats, body: Body) -> float:
