@@ -74,7 +74,7 @@ class TwoRobotsVecEnv(VecEnv):
         self._sums, self._ends = np.zeros((n, 4)), np.zeros((n, 4))  # see ``add_rows``
         # Compiled for these types beforehand: numba need not look them up at each call.
         state, packed = self._episodes.state, self._episodes.packed
-        step: Any = step_kernel(settings.action, settings.n_epm, self._episodes.world.width)
+        step: Any = step_kernel(settings.action, *self._episodes.world.shape)
         add: Any = add_rows
         self._step = step.compile(_types(0, n, self._all, self._sums, packed, state.observation))
         self._add = add.compile(_types(packed, self._sums, self._ends, state.bounds, self._all))

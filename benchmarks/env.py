@@ -22,22 +22,22 @@ from benchmarks.policies import POLICIES, Policy, Script, make_batch, script
 from benchmarks.table import LeftOut, Limit, Line, Row
 from magenv import ENV_ID
 from magenv.episodes import Settings
-from magenv.params import PLANTS
 
 TITLE = "Environment"
 
 BASE = "N = 2, 4 Hz, approach-60"
+MOVING = "N = 2, 4 Hz, approach-60, plant moving"
 CASES = {
     BASE: Settings("approach-60", n_epm=2, control_hz=4.0),
     "N = 3, 4 Hz, approach-60": Settings("approach-60", n_epm=3, control_hz=4.0),
+    MOVING: Settings("approach-60", plant="moving", n_epm=2, control_hz=4.0),
     "N = 2, 2 Hz, approach-60": Settings("approach-60", n_epm=2, control_hz=2.0),
     "N = 2, 4 Hz, random": Settings("random", n_epm=2, control_hz=4.0),
 }
 """4 Hz are 50 substeps of 5 ms, 2 Hz are 100."""
-ARM = "N = 2, 4 Hz, approach-60, plant arm"
 EPISODE = 400
 """Steps of an episode under control at 4 Hz: the record of one is played again and again."""
-HELD = {"N = 3, 4 Hz, approach-60", ARM}
+HELD = {"N = 3, 4 Hz, approach-60", MOVING}
 """Cases that must reach half of the speed of ``BASE``."""
 TURN_S, FEWEST_STEPS = 1.0, 4
 """A turn lasts about this long at most, and has so many steps at least."""
@@ -110,14 +110,9 @@ def _threads(effort: Effort) -> Iterator[Row]:
 
 def _batches(effort: Effort) -> Iterator[Line]:
     """All cases under all policies, and the peers, in one contest."""
-    cases = dict(CASES)
-    if "arm" in PLANTS:
-        cases[ARM] = Settings("approach-60", plant="arm", n_epm=2, control_hz=4.0)
-    else:
-        yield LeftOut(ARM, "this version has no magnets of finite speed")
     contestants: dict[str, Contestant] = {}
     notes: dict[str, str] = {}
-    for case, settings in cases.items():
+    for case, settings in CASES.items():
         for policy in POLICIES:
             tell(f"actions: {case}, {policy}")
             batch = Batch(script(policy, settings, effort.envs, effort.steps, effort.recorded), effort.envs)
@@ -129,7 +124,7 @@ def _batches(effort: Effort) -> Iterator[Line]:
     times = side_by_side(contestants, effort.repeats)
     for policy in POLICIES:
         yield from _against_peers(times, policy, notes[_name(BASE, policy)])
-    for case in cases:
+    for case in CASES:
         for policy in POLICIES if case != BASE else ():
             name, base = _name(case, policy), _name(BASE, policy)
             yield Row(

@@ -61,7 +61,7 @@ class Kernels:
     def __init__(self, settings: Settings, actions: NDArray[Any]) -> None:
         self.episodes = Episodes(1, settings)
         self._actions = actions.astype(np.float64)
-        step, begin = one_kernel(settings.action, settings.n_epm), begin_one
+        step, begin = one_kernel(settings.action, *self.episodes.world.shape), begin_one
 
         def play(s: State, actions: NDArray[np.float64]) -> None:
             for k in range(len(actions)):

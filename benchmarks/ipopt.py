@@ -84,7 +84,8 @@ def best(given: Problem, poses: Floats) -> tuple[float, float]:
     low, high = np.full(x.numel(), -np.inf), np.full(x.numel(), np.inf)
     low[2::POSE_SIZE], high[2::POSE_SIZE] = system.r_min_m, system.r_max_m
     nlp = {"x": x, "f": 0.5 * ca.sumsqr(error), "g": ca.vertcat(*gaps)}
-    solver = ca.nlpsol("ipopt", "ipopt", nlp, {"ipopt": OPTIONS, "print_time": False, "error_on_fail": False})
+    options: Any = {"ipopt": OPTIONS, "print_time": False, "error_on_fail": False}
+    solver = ca.nlpsol("ipopt", "ipopt", nlp, options)
     residuals, times = [math.inf], []
     for start in poses.copy():
         make_interior(start, system.r_min_m, system.r_max_m, gap)

@@ -128,6 +128,16 @@ def place_epm(
     lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i] = strength * ux, strength * uy, -strength * uz * z
 
 
+@law
+def jump(lanes: Floats, i: int, row: int, moment: float, epms: Floats, targets: Floats) -> None:
+    """Put the EPMs (n, N, 6) of a row where they are commanded, and into lane ``i``."""
+    for k in range(epms.shape[1]):
+        for j in range(EPM_SIZE):
+            epms[row, k, j] = targets[row, k, j]
+        x, y, z = epms[row, k, 0], epms[row, k, 1], epms[row, k, 2]
+        place_epm(lanes, i, k, moment, x, y, z, epms[row, k, 3], epms[row, k, 4], epms[row, k, 5])
+
+
 @kernel
 def _drag(drag: float, inertia: float, h: float) -> tuple[float, float]:
     decay = math.exp(-drag * h / inertia)

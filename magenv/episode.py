@@ -25,7 +25,7 @@ class Episode:
         self._episodes = episodes
         state, self._packed = episodes.state, episodes.packed
         # Compiled for this state beforehand: numba need not look up its type at each call.
-        step: Any = one_kernel(episodes.settings.action, episodes.settings.n_epm)
+        step: Any = one_kernel(episodes.settings.action, *episodes.world.shape)
         begin: Any = begin_one
         types = (type_of(self._packed),)
         self._step, self._begin = step.compile(types), begin.compile(types)

@@ -129,6 +129,7 @@ class Episodes:
             tracking_distance=task.tracking_distance_m,
             diameter=physics.body_diameter,
             wall_radius=physics.wall_radius,
+            speeds=w.speeds,
             targets=np.zeros(w.epms.shape),
             projected=np.zeros(n, np.bool_),
             **self.actions.constants(),
@@ -153,7 +154,7 @@ class Episodes:
 
     def _prepare(self) -> None:
         self.packed = packed(self.state)
-        self._kernel = step_kernel(self.settings.action, self.settings.n_epm, self.world.width)
+        self._kernel = step_kernel(self.settings.action, *self.world.shape)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy takes over: all but what refers to this one's own arrays."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import wrap
 from magenv.arithmetic import dot2
-from magenv.dynamics import TOUCH, WALL, advance, may_touch, place_epm, resolve_contact
+from magenv.dynamics import TOUCH, WALL, advance, jump, may_touch, resolve_contact
 from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
@@ -44,8 +44,8 @@ from magenv.lanes import (
     Y2,
     fields,
 )
-from magenv.poses import EPM_SIZE
 from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
+from magenv.travel import Speeds, arrive, carry, give_way, go_on, set_off
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -152,18 +152,21 @@ def hold_rows(
     tracking_distance: float,
     diameter: float,
     wall_radius: float,
+    speeds: Speeds,
     magnets: tuple[int, ...],
     side_by_side: tuple[int, ...],
+    moving: tuple[int, ...],
 ) -> None:
     """Hold commands for one control period or until control is lost, several rows at a time.
 
     A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
-    compute on, unseen. The lengths of the last two tuples, which are types to numba, are the numbers of EPMs and of
-    lanes: constants of the machine code, so that the magnets are unrolled and the lanes vectorised.
+    compute on, unseen. The lengths of the last three tuples, which are types to numba, are the numbers of EPMs, of
+    lanes and of EPMs of finite speed (all or none): constants of the machine code, so that the magnets are unrolled and
+    the lanes vectorised.
     """
     wide_vectors()
-    n_epm, width = len(magnets), len(side_by_side)
-    lanes, bodies = np.zeros((fields(n_epm), width)), np.empty((2, STATE_SIZE))
+    n_epm, width, travels = len(magnets), len(side_by_side), len(moving) > 0
+    lanes, bodies = np.zeros((fields(n_epm, travels), width)), np.empty((2, STATE_SIZE))
     rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
     h, upcoming, busy, idle = period / substeps, first, 0, True
     while True:
@@ -181,20 +184,10 @@ def hold_rows(
                         lanes[X1 + j, i] = robots[row, j % 2, j // 2]
                     for j in range(CONSTANTS_SIZE):
                         lanes[CONSTANTS + j, i] = constants[row, j]
-                    # The EPMs jump, as in the paper. Slower ones would travel in the loop over substeps, before
-                    # ``advance``, their state in the lane.
-                    for k in range(n_epm):
-                        for j in range(EPM_SIZE):
-                            epms[row, k, j] = targets[row, k, j]
-                        x, y, z, ux, uy, uz = (
-                            targets[row, k, 0],
-                            targets[row, k, 1],
-                            targets[row, k, 2],
-                            targets[row, k, 3],
-                            targets[row, k, 4],
-                            targets[row, k, 5],
-                        )
-                        place_epm(lanes, i, k, epm_moment[row], x, y, z, ux, uy, uz)
+                    if travels:
+                        set_off(lanes, i, row, epm_moment[row], epms, targets)
+                    else:
+                        jump(lanes, i, row, epm_moment[row], epms, targets)
                     which = trajectory_of(row, len(duration))
                     lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
                     lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
@@ -205,6 +198,17 @@ def hold_rows(
                     lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row] ** 2
             if busy == 0:
                 return
+        rare = False
+        if travels:
+            for i in range(width):
+                flagged[i] = (rows[i] >= 0) & go_on(lanes, i, n_epm, speeds)
+                rare |= flagged[i]
+            if rare:
+                for i in range(width):
+                    if flagged[i]:
+                        give_way(lanes, i, n_epm, speeds)
+            for i in range(width):
+                carry(lanes, i, n_epm, speeds)
         rare = False
         for i in range(width):
             advance(lanes, i, n_epm, h)
@@ -228,6 +232,8 @@ def hold_rows(
                 if flagged[i]:
                     for j in range(2 * STATE_SIZE):
                         robots[row, j % 2, j // 2] = lanes[X1 + j, i]
+                    if travels:
+                        arrive(lanes, i, row, epms)
                     for j in range(MEASURED_SIZE):
                         numbers[j, row] = lanes[MEASURED + j, i]
                     numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
@@ -240,12 +246,17 @@ def hold_rows(
                     busy -= 1
 
 
+def hold_shape(n_epm: int, width: int, travels: bool) -> tuple[tuple[int, ...], ...]:
+    """Return the last arguments of ``hold_rows``."""
+    return (0,) * n_epm, (0,) * width, (0,) * (n_epm if travels else 0)
+
+
 @functools.cache
-def hold_kernel(n_epm: int, width: int) -> Callable[..., None]:
-    """Return ``hold_rows`` for a number of EPMs and of lanes."""
-    magnets, side_by_side = (0,) * n_epm, (0,) * width
+def hold_kernel(n_epm: int, width: int, travels: bool) -> Callable[..., None]:
+    """Return ``hold_rows`` for a number of EPMs and of lanes, EPMs of finite speed or not."""
+    shape = hold_shape(n_epm, width, travels)
 
     def hold(*arguments: Any) -> None:
-        hold_rows(*arguments, magnets, side_by_side)  # type: ignore[call-arg]
+        hold_rows(*arguments, *shape)
 
     return kernel(hold)

@@ -37,7 +37,17 @@ EPMS = 58
 """First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
 
 
+ROUTE_SIZE = 15
+"""Fields of an EPM of finite speed, see ``travel``."""
+
+
 @law
-def fields(n_epm: int) -> int:
-    """Return the number of fields."""
+def routes(n_epm: int) -> int:
+    """Return the field of the EPMs' moment; the routes of those of finite speed follow."""
     return EPMS + EPM_SIZE * n_epm
+
+
+@law
+def fields(n_epm: int, travels: bool) -> int:
+    """Return the number of fields, with routes or without."""
+    return routes(n_epm) + (1 + ROUTE_SIZE * n_epm if travels else 0)

@@ -153,9 +153,16 @@ class Plant:
     """Radius of the circular wall."""
     substep_s: float = 0.005
     """The integrator's step, fixed in seconds whatever the control rate."""
+    epm_speed_mps: float = math.inf
+    """Speed of an EPM's centre, m/s; without limit the EPMs jump (paper)."""
+    epm_turn_radps: float = math.inf
+    """Angular speed of an EPM's moment, rad/s; without limit the EPMs jump (paper)."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
+        for name in ("epm_speed_mps", "epm_turn_radps"):
+            value = getattr(self, name)
+            require(value == math.inf or (_is_number(value) and value > 0), name, "a number above 0", value)
         require(
             self.workspace_radius_m > self.body.diameter_m,
             "workspace_radius_m",
@@ -163,9 +170,19 @@ class Plant:
             self.workspace_radius_m,
         )
 
+    @property
+    def epms_jump(self) -> bool:
+        """Whether the EPMs are at once where they are commanded."""
+        return self.epm_speed_mps == math.inf and self.epm_turn_radps == math.inf
 
-PLANTS: dict[str, Plant] = {"paper": Plant()}
-"""The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation."""
+
+PLANTS: dict[str, Plant] = {
+    "paper": Plant(),
+    # Data sheets of the UR5e and UR10e: typical speed of the tool 1 m/s, wrists 180 degrees/s.
+    "moving": Plant(epm_speed_mps=1.0, epm_turn_radps=math.pi),
+}
+"""The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation. ``moving``: the same, but the
+EPMs move there at finite speed, and act on the robots on the way."""
 
 
 CONTROL_HZ_RANGE = (0.01, 1000.0)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, pose_rows, step_rows, wrench_rows
-from magenv.hold import hold_rows
+from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel
 from magenv.starts import place_rows
@@ -170,6 +170,7 @@ def _hold(
     observations: Observations,
     magnets: tuple[int, ...],
     side_by_side: tuple[int, ...],
+    moving: tuple[int, ...],
 ) -> None:
     """Hold the commanded EPMs for one control period; what that paid, and what is told of all rows."""
     hold_rows(
@@ -193,20 +194,23 @@ def _hold(
         s.tracking_distance,
         s.diameter,
         s.wall_radius,
+        s.speeds,
         magnets,
         side_by_side,
+        moving,
     )
     _settle_rows(first, last, active, s)
     tell_rows(first, last, s.every, s, observations)
 
 
 @functools.cache
-def step_kernel(mode: ActionMode, n_epm: int, width: int) -> Step:
+def step_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Step:
     """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
 
-    Mode, number of EPMs and of lanes are constants of the machine code: of the branches one is compiled.
+    Mode, number of EPMs and of lanes, and whether the EPMs travel, are constants of the machine code: of the branches
+    one is compiled.
     """
-    magnets, side_by_side = (0,) * n_epm, (0,) * width
+    shape = hold_shape(n_epm, width, travels)
 
     def step_episodes(
         first: int, last: int, active: Bools, actions: Floats, s: State, observations: Observations
@@ -219,15 +223,15 @@ def step_kernel(mode: ActionMode, n_epm: int, width: int) -> Step:
             _step(first, last, active, actions, s)
         else:
             _wrench(first, last, active, actions, s)
-        _hold(first, last, active, s, observations, magnets, side_by_side)
+        _hold(first, last, active, s, observations, *shape)
 
     return kernel(step_episodes)
 
 
 @functools.cache
-def one_kernel(mode: ActionMode, n_epm: int) -> Callable[[State], tuple[object, ...]]:
+def one_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Callable[[State], tuple[object, ...]]:
     """Return the kernel that steps the only episode by ``action``, clipped; one that is not finite moves nothing."""
-    magnets, side_by_side = (0,) * n_epm, (0,)
+    shape = hold_shape(n_epm, width, travels)
 
     def step_one(s: State) -> tuple[object, ...]:
         fit = clip(s.action[0])
@@ -240,7 +244,7 @@ def one_kernel(mode: ActionMode, n_epm: int) -> Callable[[State], tuple[object, 
                 _step(0, 1, s.every, s.action, s)
             else:
                 _wrench(0, 1, s.every, s.action, s)
-            _hold(0, 1, s.every, s, s.observation, magnets, side_by_side)
+            _hold(0, 1, s.every, s, s.observation, *shape)
         paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
         return (
             fit,

@@ -18,6 +18,7 @@ from magenv.lanes import CONSTANTS_SIZE
 from magenv.params import Plant, System, TaskParams
 from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
 from magenv.trajectories import SEGMENTS, Trajectory, reference_of, trajectory_of
+from magenv.travel import Speeds
 from magenv.workers import Workers
 
 __all__ = ["LOSSES", "Measurements", "World"]
@@ -175,8 +176,10 @@ class World:
         The trajectories; one where all rows follow the same.
     constants : ndarray, shape (n, 10)
         Of a substep, see ``magenv.dynamics.constants``.
-    width : int
-        Lanes of the hold.
+    shape : tuple
+        Number of EPMs, lanes of the hold, whether the EPMs travel.
+    speeds : Speeds
+        Limits of the EPMs' motion.
     held : tuple
         The last arguments of the hold, the same at every step.
     """
@@ -196,8 +199,8 @@ class World:
         self.substeps = max(1, math.ceil(task.period_s / plant.substep_s - 1e-9))
         self._tracking_distance = task.tracking_distance_m
         self._workers = workers or Workers()
-        self.width = 1 if n <= _FEW else _WIDTH
-        self._hold = hold_kernel(system.n_epm, self.width)
+        self.shape = (system.n_epm, 1 if n <= _FEW else _WIDTH, not plant.epms_jump)
+        self._hold = hold_kernel(*self.shape)
         self.robots: Floats = np.zeros((n, 2, 6))
         self.epms: Floats = np.zeros((n, system.n_epm, 6))
         own = n if trajectory is None else 1
@@ -207,6 +210,7 @@ class World:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
         self.step_count: Integers = np.zeros(n, np.int64)
         self.measurements = Measurements(n)
+        self.speeds = Speeds.of(system, plant, task.period_s / self.substeps)
         self.constants: Floats = np.empty((n, CONSTANTS_SIZE))
         constants(self.physics, task.period_s / self.substeps, self.constants)
         self.held = (
@@ -224,6 +228,7 @@ class World:
             task.tracking_distance_m,
             self.physics.body_diameter,
             self.physics.wall_radius,
+            self.speeds,
         )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:

@@ -23,7 +23,7 @@ def magnets(rng: np.random.Generator, system: System = SYSTEM) -> Floats:
 
 def one_lane(robots: Floats, epms: Floats, physics: Physics, h: float) -> Floats:
     """A single lane (fields, 1) with these robots (2, 6) and EPMs (N, 6)."""
-    lane, row = np.zeros((fields(len(epms)), 1)), np.empty((1, CONSTANTS_SIZE))
+    lane, row = np.zeros((fields(len(epms), False), 1)), np.empty((1, CONSTANTS_SIZE))
     constants(physics, h, row)
     lane[:12, 0] = robots.T.reshape(-1)  # both robots' x, then both y, ...
     lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row

@@ -17,7 +17,6 @@ PACKAGE = Path(magenv.__file__).parent
 ORDER = [
     "params",
     "kernels",
-    "state",
     "arithmetic",
     "angles",
     "workers",
@@ -37,6 +36,8 @@ ORDER = [
     "trajectories",
     "lanes",
     "dynamics",
+    "travel",
+    "state",
     "hold",
     "world",
     "home",

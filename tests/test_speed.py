@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magenv.env import TwoRobots
-from magenv.hold import hold_rows
+from magenv.hold import hold_rows, hold_shape
 from magenv.params import System, TaskParams
 from magenv.trajectories import approach
 from magenv.vector_env import TwoRobotsVector
@@ -52,10 +52,12 @@ def same(one: Steps, two: Steps, rows: slice) -> bool:
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])
-@pytest.mark.parametrize("scenario", ["approach-45", "random"])
-def test_bits_depend_neither_on_lanes_nor_on_threads(scenario: str, n_epm: int) -> None:
+@pytest.mark.parametrize(
+    ("scenario", "plant"), [("approach-45", "paper"), ("random", "paper"), ("approach-45", "moving")]
+)
+def test_bits_depend_neither_on_lanes_nor_on_threads(scenario: str, plant: str, n_epm: int) -> None:
     """Many, few and single episodes, one to three threads, through many starts."""
-    arguments = {"scenario": scenario, "n_epm": n_epm, "control_hz": 10.0}
+    arguments = {"scenario": scenario, "plant": plant, "n_epm": n_epm, "control_hz": 10.0}
     together = batch(N, 0, **arguments)
     flags = np.array([step[2] for step in together[1:]])
     assert flags.any(axis=0).mean() > 0.9, "most episodes must end and begin anew"
@@ -140,7 +142,7 @@ def compiled() -> Any:
     cached: Any = hold_rows
     world, idle = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams()), np.zeros(16, np.bool_)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
-    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, (0,) * 2, (0,) * 16)
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(2, 16, False))
     return fresh
 
 

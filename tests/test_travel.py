@@ -1,0 +1,169 @@
+"""EPMs of finite speed: limits kept all the way, the way itself, what it does to the robots."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from lane import magnets
+from numpy.typing import NDArray
+
+from magenv.env import TwoRobots
+from magenv.params import PLANTS, Plant, System, TaskParams
+from magenv.poses import from_cartesian
+from magenv.trajectories import approach
+from magenv.world import World
+from magenv.wrench import planar_moments, robot_wrench
+
+Floats = NDArray[np.float64]
+
+PLANT = PLANTS["moving"]
+H = PLANT.substep_s
+FREE = TaskParams(control_hz=1.0 / H, loss_distance_m=10.0)
+"""A hold is one substep, so that every one is seen; the robots may go where they like."""
+
+
+def world_of(systems: System, starts: Floats, plant: Plant = PLANT, task: TaskParams = FREE) -> World:
+    """A world whose EPMs stand at ``starts`` (n, N, 6), the robots at rest."""
+    world, trajectory = World(len(starts), systems, plant, task), approach(0.060)
+    robots = np.zeros((2, 6))
+    robots[:, :3] = trajectory.at(0.0)
+    for row, epms in enumerate(starts):
+        world.start(row, trajectory, robots, epms)
+    return world
+
+
+def ways(system: System, starts: Floats, goals: Floats, substeps: int, plant: Plant = PLANT) -> Floats:
+    """Where the EPMs are after each substep, (substeps + 1, n, N, 6)."""
+    world, path = world_of(system, starts, plant), [starts.copy()]
+    for _ in range(substeps):
+        world.step(goals, np.ones(len(starts), np.bool_))
+        path.append(world.epms.copy())
+    return np.array(path)
+
+
+def angle(u: Floats, v: Floats) -> Floats:
+    return np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), (u * v).sum(-1))
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_limits_hold_all_the_way(rng: np.random.Generator, n_epm: int) -> None:
+    """Speeds, radii and least gap, between random allowed poses, the goal changed before it is reached."""
+    system = System(n_epm=n_epm)
+    draw = np.array([[magnets(rng, system) for _ in range(40)] for _ in range(4)])
+    path = [draw[0][None]]
+    for goals in draw[1:]:
+        path.append(ways(system, path[-1][-1], goals, 120)[1:])
+    way = np.concatenate(path)
+    centres, moments = way[..., :3], way[..., 3:]
+    radii = np.linalg.norm(centres, axis=-1)
+    assert radii.min() > system.r_min_m - 1e-9
+    assert radii.max() < system.r_max_m + 1e-9
+    np.testing.assert_allclose(np.linalg.norm(moments, axis=-1), 1.0, atol=1e-12)
+    moved = np.linalg.norm(np.diff(centres, axis=0), axis=-1)
+    assert moved.max() < PLANT.epm_speed_mps * H * 1.001
+    assert moved.max() > PLANT.epm_speed_mps * H * 0.99
+    turned = angle(moments[1:], moments[:-1])
+    assert turned.max() == pytest.approx(PLANT.epm_turn_radps * H, rel=1e-6)
+    for k in range(n_epm):
+        for j in range(k):
+            gaps = np.linalg.norm(centres[:, :, k] - centres[:, :, j], axis=-1)
+            assert gaps.min() > system.gap_min_m - 1e-9
+            assert gaps.min() < system.gap_min_m + 1e-3, "some pass each other as near as they may"
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_epms_arrive_and_stay(rng: np.random.Generator, n_epm: int) -> None:
+    """They come to random goals within half as long again as the longest way takes; there they rest."""
+    system = System(n_epm=n_epm)
+    starts, goals = (np.array([magnets(rng, system) for _ in range(60)]) for _ in range(2))
+    longest = math.pi * system.r_max_m / PLANT.epm_speed_mps
+    way = ways(system, starts, goals, math.ceil(1.5 * longest / H))
+    there = (np.abs(way[-1] - goals) < 2e-9).all(axis=(1, 2))  # the gap of goals is kept within 1e-9 m
+    assert there.mean() > 0.95
+    np.testing.assert_allclose(way[-2][there], way[-1][there], rtol=0, atol=1e-9)
+
+
+def test_a_way_is_a_great_circle_at_full_speed(rng: np.random.Generator) -> None:
+    """One EPM goes, the other rests far away: in one plane with start and goal, the radius in step with the angle."""
+    system, plant = System(), PLANT
+    starts = np.tile([[0.2, 0, 0, 1, 0, 0], [-0.5, 0, 0, 1, 0, 0]], (1, 1, 1)).astype(np.float64)
+    goals = starts.copy()
+    goals[0, 0] = [0.0, 0.3 * math.cos(0.5), 0.3 * math.sin(0.5), 0.0, 1.0, 0.0]
+    way = ways(system, starts, goals, 400)[:, 0, 0]
+    last = int(np.flatnonzero((way[:, :3] == goals[0, 0, :3]).all(axis=1))[0])
+    normal = np.cross(starts[0, 0, :3], goals[0, 0, :3])
+    assert np.abs(way[:, :3] @ normal).max() < 1e-12
+    radii, around = np.linalg.norm(way[:, :3], axis=1), angle(way[:, :3], starts[0, 0, :3])
+    share = around[:last] / (0.5 * math.pi)
+    np.testing.assert_allclose(radii[:last], 0.2 + 0.1 * share, atol=1e-5)
+    steps = np.linalg.norm(np.diff(way[:last, :3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, plant.epm_speed_mps * H, rtol=1e-3)
+    quarter = 0.5 * math.pi / plant.epm_turn_radps
+    aligned = int(np.flatnonzero((way[:, 3:] == goals[0, 0, 3:]).all(axis=1))[0])
+    assert aligned == math.ceil(quarter / H - 1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_opposite_goals_are_reached(axis: int) -> None:
+    """To the other side of the workspace and to the opposite moment there is no shortest way: one is taken."""
+    start = np.zeros((1, 2, 6))
+    start[0, 0, axis], start[0, 0, 3 + axis] = 0.2, 1.0
+    start[0, 1, (axis + 1) % 3], start[0, 1, 3] = 0.5, 1.0
+    goal = start.copy()
+    goal[0, 0] *= -1.0
+    way = ways(System(), start, goal, math.ceil(math.pi * 0.5 / PLANT.epm_speed_mps / H))
+    np.testing.assert_array_equal(way[-1], goal)
+    assert np.linalg.norm(way[:, 0, 0, :3], axis=1).min() > 0.15 - 1e-9
+
+
+def test_epms_act_on_the_way(rng: np.random.Generator) -> None:
+    """The robots' speeds after a hold, against a sum of the wrenches along the way, the robots too heavy to move."""
+    heavy = dataclasses.replace(
+        PLANT, body=dataclasses.replace(PLANT.body, mass_kg=1e3, inertia_kgm2=1e3, drag_linear_nspm=0.0)
+    )
+    system, task = System(), TaskParams(loss_distance_m=10.0)
+    starts, goals = (np.array([magnets(rng, system) for _ in range(20)]) for _ in range(2))
+    fine = dataclasses.replace(heavy, substep_s=H / 10)
+    world = world_of(system, starts, heavy, task)
+    world.step(goals, np.ones(20, np.bool_))
+    way = np.array(ways(system, starts, goals, 1000, dataclasses.replace(fine, substep_s=H / 10)))
+    robots = world_of(system, starts).robots[0, :, :3]
+    positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=1)
+    moments = planar_moments(robots[:, 2], system.ipm_moment_am2)
+    apart = np.linalg.norm(way[:101, :, 0, :3] - way[:101, :, 1, :3], axis=-1).min(axis=0)
+    free = np.flatnonzero(apart > system.gap_min_m + 0.01)  # where they give way, it depends on the substep how
+    assert len(free) > 5
+    for row in free:
+        # ten substeps a hold of 5 ms: way[k] is at 5 ms k
+        poses = from_cartesian(way[:101, row, :, :3], way[:101, row, :, 3:])
+        u = robot_wrench(positions, moments, poses, system.epm_moment_am2)
+        impulse, most = np.trapezoid(u, dx=H, axis=0), np.trapezoid(np.abs(u), dx=H, axis=0)
+        for robot in range(2):
+            c, s = np.cos(robots[robot, 2]), np.sin(robots[robot, 2])
+            _, torque, along, across, _ = impulse[5 * robot : 5 * robot + 5]
+            vx, vy, rate = world.robots[row, robot, 3:] * 1e3
+            got = np.array([rate, c * vx + s * vy, c * vy - s * vx])
+            off, scale = np.abs(got - [torque, along, across]), most[5 * robot + 1 : 5 * robot + 4]
+            np.testing.assert_array_less(off, 5e-3 * scale)  # 0.1 % of speed is 0.1 mm of way
+
+
+def test_commands_far_away_act_late(rng: np.random.Generator) -> None:
+    """After a hold the EPMs of ``moving`` are on the way where those of ``paper`` are at their goal; info says so."""
+    action = rng.uniform(-1, 1, 10).astype(np.float32)
+    poses = {}
+    for plant in ("paper", "moving"):
+        env = TwoRobots(scenario="approach-60", plant=plant, control_hz=10.0)
+        start = env.reset(seed=0)[1]["epm_pose"]
+        poses[plant] = env.step(action)[4]["epm_pose"]
+    assert np.abs(poses["moving"] - start)[[2, 7]].max() <= 0.1 + 1e-9
+    assert np.abs(poses["paper"] - poses["moving"]).max() > 0.1
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, "1"])
+@pytest.mark.parametrize("name", ["epm_speed_mps", "epm_turn_radps"])
+def test_speeds_must_be_positive(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"Input {name} must be a number above 0"):
+        dataclasses.replace(PLANT, **{name: value})
