@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.floor import Kernels, nothing
+from benchmarks.floor import Kernels, nothing, products
 from benchmarks.measure import EXTRA, Contestant, Effort, Times, installed, on_cores, side_by_side, tell
 from benchmarks.peak import gain_of_two, multiply_adds
 from benchmarks.policies import POLICIES, Policy, Script, make_batch, script
@@ -35,6 +35,9 @@ CASES = {
     "N = 2, 4 Hz, random": Settings("random", n_epm=2, control_hz=4.0),
 }
 """4 Hz are 50 substeps of 5 ms, 2 Hz are 100."""
+SUBSTEPS = 50
+"""Of ``BASE``."""
+PEAK = "peak of one core"
 EPISODE = 400
 """Steps of an episode under control at 4 Hz: the record of one is played again and again."""
 HELD = {"N = 3, 4 Hz, approach-60", MOVING}
@@ -120,10 +123,11 @@ def _batches(effort: Effort) -> Iterator[Line]:
             contestants[name] = batch.contestant()
             resets, substeps = batch.observed()
             notes[name] = f"per step {resets:.2g} resets, {substeps:.3g} substeps"
-    contestants |= dict(_vector_peers(effort))
+    contestants |= dict(_vector_peers(effort)) | {PEAK: multiply_adds(1)}
     times = side_by_side(contestants, effort.repeats)
     for policy in POLICIES:
         yield from _against_peers(times, policy, notes[_name(BASE, policy)])
+    yield from _bounds(times)
     for case in CASES:
         for policy in POLICIES if case != BASE else ():
             name, base = _name(case, policy), _name(BASE, policy)
@@ -156,6 +160,17 @@ def _against_peers(times: Times, policy: Policy, note: str) -> Iterator[Row]:
         if peer in times.of:
             ratio = times.speedup(name, peer)
             yield Row(name, times.rate(name), "steps/s", peer, times.rate(peer), ratio, limit, note)
+
+
+def _bounds(times: Times) -> Iterator[Row]:
+    """How fast a step would be that had nothing but the products of its hold, at the peak measured beside it."""
+    each = products(CASES[BASE])
+    flops = 2.0 * each * SUBSTEPS  # that of a product and a sum
+    for peer in ("EnvPool CartPole, same envs", "HalfCheetah-v5"):
+        if peer in times.of:
+            bound, ratio = times.rate(PEAK) / flops, times.speedup(PEAK, peer) / flops
+            note = f"{each} a substep, {SUBSTEPS} substeps, at the peak of multiply-adds; no other work at all"
+            yield Row(f"products of a hold alone, {BASE}", bound, "steps/s", peer, times.rate(peer), ratio, note=note)
 
 
 def _vector_peers(effort: Effort) -> Iterator[tuple[str, Contestant]]:

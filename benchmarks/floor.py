@@ -1,7 +1,8 @@
-"""What a scalar step cannot go below: an environment that does nothing, and the laws of a step without Python."""
+"""What steps cannot go below: an environment that does nothing, the laws without Python, the products of a hold."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import gymnasium
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.measure import Contestant
 from magenv.env import TwoRobots
 from magenv.episodes import Episodes, Settings
+from magenv.hold import hold_rows, hold_shape
 from magenv.state import State
 from magenv.steps import begin_one, one_kernel
 
@@ -85,3 +87,22 @@ class Kernels:
     def contestant(self) -> Contestant:
         """Return this loop as a contestant."""
         return Contestant(self.run, len(self._actions), self.reset)
+
+
+_PRODUCT = re.compile(r"^\s+v(?:fn?m(?:add|sub)\d+|mul)pd\b", re.M)
+_LOOP = 20
+"""A part of the machine code with so many vectors of products is one of the loops over lanes."""
+
+
+def products(settings: Settings) -> int:
+    """Return how many products, alone or with a sum in one instruction, a substep has in the vectorised machine code.
+
+    The hold is compiled anew: numba does not show cached code.
+    """
+    cached: Any = hold_rows
+    world, idle = Episodes(16, settings).world, np.zeros(16, np.bool_)
+    fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(settings.n_epm, 16, False))
+    (assembly,) = fresh.inspect_asm().values()
+    counts = [len(_PRODUCT.findall(part)) for part in re.split(r"^\.L\w+:$", assembly, flags=re.M)]
+    return sum(count for count in counts if count >= _LOOP)

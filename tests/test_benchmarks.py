@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ from benchmarks.policies import script
 from benchmarks.table import HEAD, LeftOut, Limit, Line, Row, console, markdown, page, text
 from magenv import ENV_ID
 from magenv.allocation import allocate
+from magenv.episodes import Settings
 from magenv.poses import POSE_SIZE
 
 TINY = Effort(
@@ -103,6 +105,14 @@ def test_kernels_without_python_play_what_the_env_plays() -> None:
         played.reset()
         played.run()
         np.testing.assert_array_equal(played.episodes.state.robots[0], info["robots"])
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+def test_products_of_a_substep_are_counted() -> None:
+    """Five dipoles of about thirty, two pairs of sine and cosine, six cubics; not those of single lanes."""
+    two, three = (floor.products(Settings("approach-60", n_epm=n, control_hz=4.0)) for n in (2, 3))
+    assert 200 < two < 350
+    assert 40 < three - two < 80, "two dipoles more"
 
 
 def test_contestants_take_turns_and_the_first_is_for_warming_up() -> None:
