@@ -271,7 +271,7 @@ def field(moment: ArrayLike, source: ArrayLike, point: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3)
-        B in T; NaN where point and source coincide.
+        B in T, for distances from 1e-60 to 1e60 m; NaN where point and source coincide.
 
     Raises
     ------

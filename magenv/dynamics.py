@@ -109,10 +109,10 @@ def robots_wrench(
     on1, on2 = none, none
     for k in range(n_epm):
         e = EPMS + EPM_SIZE * k
-        ex, ey, z2 = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
-        sx, sy, s_z = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
-        on1 = add_source(on1, sx, sy, s_z, m1x, m1y, x1 - ex, y1 - ey, z2)
-        on2 = add_source(on2, sx, sy, s_z, m2x, m2y, x2 - ex, y2 - ey, z2)
+        ex, ey, height2 = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
+        sx, sy, s_height = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
+        on1 = add_source(on1, sx, sy, s_height, m1x, m1y, x1 - ex, y1 - ey, height2)
+        on2 = add_source(on2, sx, sy, s_height, m2x, m2y, x2 - ex, y2 - ey, height2)
     f1x, f1y, tz1 = planar_wrench(on1, m1x, m1y)
     f2x, f2y, tz2 = planar_wrench(on2, m2x, m2y)
     return f1x - fx, f1y - fy, tz1 - (cross2(dx, dy, fx, fy) + turn), f2x + fx, f2y + fy, tz2 + turn

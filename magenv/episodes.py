@@ -129,7 +129,7 @@ class Episodes:
             tracking_distance=task.tracking_distance_m,
             diameter=physics.body_diameter,
             wall_radius=physics.wall_radius,
-            speeds=w.speeds,
+            motion=w.motion,
             targets=np.zeros(w.epms.shape),
             projected=np.zeros(n, np.bool_),
             **self.actions.constants(),

@@ -45,7 +45,7 @@ from magenv.lanes import (
     fields,
 )
 from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
-from magenv.travel import Speeds, arrive, carry, give_way, go_on, set_off
+from magenv.travel import Motion, arrive, carry, give_way, go_on, set_off
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -152,7 +152,7 @@ def hold_rows(
     tracking_distance: float,
     diameter: float,
     wall_radius: float,
-    speeds: Speeds,
+    motion: Motion,
     magnets: tuple[int, ...],
     side_by_side: tuple[int, ...],
     moving: tuple[int, ...],
@@ -160,9 +160,9 @@ def hold_rows(
     """Hold commands for one control period or until control is lost, several rows at a time.
 
     A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
-    compute on, unseen. The lengths of the last three tuples, which are types to numba, are the numbers of EPMs, of
-    lanes and of EPMs of finite speed (all or none): constants of the machine code, so that the magnets are unrolled and
-    the lanes vectorised.
+    compute on, unseen. The lengths of the last three tuples, which are types to numba, are the numbers of EPMs and of
+    lanes, and whether the EPMs travel: constants of the machine code, so that the magnets are unrolled and the lanes
+    vectorised.
     """
     wide_vectors()
     n_epm, width, travels = len(magnets), len(side_by_side), len(moving) > 0
@@ -201,14 +201,14 @@ def hold_rows(
         rare = False
         if travels:
             for i in range(width):
-                flagged[i] = (rows[i] >= 0) & go_on(lanes, i, n_epm, speeds)
+                flagged[i] = (rows[i] >= 0) & go_on(lanes, i, n_epm, motion)
                 rare |= flagged[i]
             if rare:
                 for i in range(width):
                     if flagged[i]:
-                        give_way(lanes, i, n_epm, speeds)
+                        give_way(lanes, i, n_epm, motion)
             for i in range(width):
-                carry(lanes, i, n_epm, speeds)
+                carry(lanes, i, n_epm, motion)
         rare = False
         for i in range(width):
             advance(lanes, i, n_epm, h)
@@ -248,7 +248,7 @@ def hold_rows(
 
 def hold_shape(n_epm: int, width: int, travels: bool) -> tuple[tuple[int, ...], ...]:
     """Return the last arguments of ``hold_rows``."""
-    return (0,) * n_epm, (0,) * width, (0,) * (n_epm if travels else 0)
+    return (0,) * n_epm, (0,) * width, (0,) * travels
 
 
 @functools.cache

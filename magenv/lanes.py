@@ -42,12 +42,18 @@ ROUTE_SIZE = 15
 
 
 @law
-def routes(n_epm: int) -> int:
-    """Return the field of the EPMs' moment; the routes of those of finite speed follow."""
+def carried_moment(n_epm: int) -> int:
+    """Return the field of the moment of EPMs of finite speed, A m^2."""
     return EPMS + EPM_SIZE * n_epm
+
+
+@law
+def route(n_epm: int, k: int) -> int:
+    """Return the first field of the ``k``-th EPM's route."""
+    return carried_moment(n_epm) + 1 + ROUTE_SIZE * k
 
 
 @law
 def fields(n_epm: int, travels: bool) -> int:
     """Return the number of fields, with routes or without."""
-    return routes(n_epm) + (1 + ROUTE_SIZE * n_epm if travels else 0)
+    return route(n_epm, n_epm) if travels else EPMS + EPM_SIZE * n_epm

@@ -144,6 +144,10 @@ class Body:
             require(_is_number(value) and value >= 0, name, "a finite number of at least 0", value)
 
 
+EPM_WAY_MAX_M, EPM_TURN_MAX_RAD = 0.02, 0.2
+"""Greatest way and turn of an EPM in a substep: what it does halfway must stand for what it does on the way."""
+
+
 @dataclass(frozen=True)
 class Plant:
     """What the controllers act on: bodies, wall, integrator."""
@@ -154,15 +158,20 @@ class Plant:
     substep_s: float = 0.005
     """The integrator's step, fixed in seconds whatever the control rate."""
     epm_speed_mps: float = math.inf
-    """Speed of an EPM's centre, m/s; without limit the EPMs jump (paper)."""
+    """Greatest speed of an EPM's centre, m/s; infinite together with the next, the EPMs jump (paper)."""
     epm_turn_radps: float = math.inf
-    """Angular speed of an EPM's moment, rad/s; without limit the EPMs jump (paper)."""
+    """Greatest angular speed of an EPM's moment, rad/s."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
-        for name in ("epm_speed_mps", "epm_turn_radps"):
+        for name, other, most in (
+            ("epm_speed_mps", self.epm_turn_radps, EPM_WAY_MAX_M / self.substep_s),
+            ("epm_turn_radps", self.epm_speed_mps, EPM_TURN_MAX_RAD / self.substep_s),
+        ):
             value = getattr(self, name)
-            require(value == math.inf or (_is_number(value) and value > 0), name, "a number above 0", value)
+            fits = _is_number(value) and 0.0 < value <= most and other != math.inf
+            must_be = f"a number above 0 and at most {most:g}, or infinite as the other limit of the EPMs' speed is"
+            require(fits or value == other == math.inf, name, must_be, value)
         require(
             self.workspace_radius_m > self.body.diameter_m,
             "workspace_radius_m",
@@ -173,7 +182,7 @@ class Plant:
     @property
     def epms_jump(self) -> bool:
         """Whether the EPMs are at once where they are commanded."""
-        return self.epm_speed_mps == math.inf and self.epm_turn_radps == math.inf
+        return self.epm_speed_mps == math.inf
 
 
 PLANTS: dict[str, Plant] = {

@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel
-from magenv.travel import Speeds
+from magenv.travel import Motion
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -52,7 +52,7 @@ class State(NamedTuple):
     tracking_distance: float
     diameter: float
     wall_radius: float
-    speeds: Speeds
+    motion: Motion
 
     targets: Floats
     """(n, N, 6) commanded EPMs."""

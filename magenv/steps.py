@@ -194,7 +194,7 @@ def _hold(
         s.tracking_distance,
         s.diameter,
         s.wall_radius,
-        s.speeds,
+        s.motion,
         magnets,
         side_by_side,
         moving,

@@ -18,7 +18,7 @@ from magenv.lanes import CONSTANTS_SIZE
 from magenv.params import Plant, System, TaskParams
 from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
 from magenv.trajectories import SEGMENTS, Trajectory, reference_of, trajectory_of
-from magenv.travel import Speeds
+from magenv.travel import Motion
 from magenv.workers import Workers
 
 __all__ = ["LOSSES", "Measurements", "World"]
@@ -178,7 +178,7 @@ class World:
         Of a substep, see ``magenv.dynamics.constants``.
     shape : tuple
         Number of EPMs, lanes of the hold, whether the EPMs travel.
-    speeds : Speeds
+    motion : Motion
         Limits of the EPMs' motion.
     held : tuple
         The last arguments of the hold, the same at every step.
@@ -210,7 +210,7 @@ class World:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
         self.step_count: Integers = np.zeros(n, np.int64)
         self.measurements = Measurements(n)
-        self.speeds = Speeds.of(system, plant, task.period_s / self.substeps)
+        self.motion = Motion.of(system, plant, task.period_s / self.substeps)
         self.constants: Floats = np.empty((n, CONSTANTS_SIZE))
         constants(self.physics, task.period_s / self.substeps, self.constants)
         self.held = (
@@ -228,7 +228,7 @@ class World:
             task.tracking_distance_m,
             self.physics.body_diameter,
             self.physics.wall_radius,
-            self.speeds,
+            self.motion,
         )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:

@@ -52,20 +52,20 @@ def add_source(
     sums: PlanarSums,
     sx: float,
     sy: float,
-    s_z: float,
+    s_height: float,
     nx: float,
     ny: float,
     rx: float,
     ry: float,
-    z2: float,
+    height2: float,
 ) -> PlanarSums:
     """Return the sums with a source's share added, for a moment n in the plane at the offset (rx, ry) in the plane.
 
-    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``z2`` is the square of the source's height
-    z and ``s_z`` is minus the product of its strength's z component and z: all that enters of what is out of the plane.
+    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``height2`` is the square of the source's
+    height and ``s_height`` minus the height times the strength's z component: all that enters of what is out of plane.
     """
     bx, by, along, fx, fy = sums
-    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, z2)), fma(sx, rx, fma(sy, ry, s_z)), dot2(nx, ny, rx, ry)
+    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, height2)), fma(sx, rx, fma(sy, ry, s_height)), dot2(nx, ny, rx, ry)
     k, on_n, on_s, on_r = dipole_parts(r2, s_r, n_r, dot2(sx, sy, nx, ny))
     return (
         fma(on_n, rx, fma(k, sx, bx)),

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import pickle
 
 import numpy as np
 import pytest
 from lane import magnets
 from numpy.typing import NDArray
 
+from magenv.actions import ActionMode
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.trajectories import approach
+from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
 from magenv.wrench import planar_moments, robot_wrench
 
@@ -129,16 +132,16 @@ def test_epms_act_on_the_way(rng: np.random.Generator) -> None:
     fine = dataclasses.replace(heavy, substep_s=H / 10)
     world = world_of(system, starts, heavy, task)
     world.step(goals, np.ones(20, np.bool_))
-    way = np.array(ways(system, starts, goals, 1000, dataclasses.replace(fine, substep_s=H / 10)))
+    way = ways(system, starts, goals, 100, fine)
     robots = world_of(system, starts).robots[0, :, :3]
     positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=1)
     moments = planar_moments(robots[:, 2], system.ipm_moment_am2)
-    apart = np.linalg.norm(way[:101, :, 0, :3] - way[:101, :, 1, :3], axis=-1).min(axis=0)
+    apart = np.linalg.norm(way[:, :, 0, :3] - way[:, :, 1, :3], axis=-1).min(axis=0)
     free = np.flatnonzero(apart > system.gap_min_m + 0.01)  # where they give way, it depends on the substep how
     assert len(free) > 5
     for row in free:
         # ten substeps a hold of 5 ms: way[k] is at 5 ms k
-        poses = from_cartesian(way[:101, row, :, :3], way[:101, row, :, 3:])
+        poses = from_cartesian(way[:, row, :, :3], way[:, row, :, 3:])
         u = robot_wrench(positions, moments, poses, system.epm_moment_am2)
         impulse, most = np.trapezoid(u, dx=H, axis=0), np.trapezoid(np.abs(u), dx=H, axis=0)
         for robot in range(2):
@@ -162,8 +165,66 @@ def test_commands_far_away_act_late(rng: np.random.Generator) -> None:
     assert np.abs(poses["paper"] - poses["moving"]).max() > 0.1
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, "1"])
+@pytest.mark.parametrize("off", [0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5])
+def test_moments_stay_unit_vectors_whatever_is_commanded(rng: np.random.Generator, off: float) -> None:
+    """Goals always opposite to the present moment, or nearly: the way round is ill-defined, its length is not."""
+    system = System()
+    starts = np.array([magnets(rng, system) for _ in range(20)])
+    world = world_of(system, starts)
+    for _ in range(60):
+        goals = starts.copy()
+        across = np.cross(world.epms[..., 3:], rng.normal(size=(20, 2, 3)))
+        goals[..., 3:] = -world.epms[..., 3:] + off * across
+        goals[..., 3:] /= np.linalg.norm(goals[..., 3:], axis=-1, keepdims=True)
+        before = world.epms.copy()
+        world.step(goals, np.ones(20, np.bool_))
+        np.testing.assert_allclose(np.linalg.norm(world.epms[..., 3:], axis=-1), 1.0, atol=1e-14)
+        turned = angle(before[..., 3:], world.epms[..., 3:])
+        np.testing.assert_allclose(turned, PLANT.epm_turn_radps * H, rtol=1e-6)
+
+
+def test_the_last_substep_is_no_faster() -> None:
+    """A goal farther out and round, just within reach by the present radius, but not by the one in between."""
+    reach = PLANT.epm_speed_mps * H
+    out, around = 0.999 * reach / math.sqrt(3.0), 0.999 * reach * math.sqrt(2.0 / 3.0) / 0.15
+    start = np.array([[[0.15, 0, 0, 1, 0, 0], [-0.5, 0, 0, 1, 0, 0]]], dtype=np.float64)
+    goal = start.copy()
+    goal[0, 0, :2] = (0.15 + out) * math.cos(around), (0.15 + out) * math.sin(around)
+    way = ways(System(), start, goal, 3)[:, 0, 0, :3]
+    assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < reach * 1.0005
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_epms_that_change_places_pass_each_other(n_epm: int) -> None:
+    """Head on, in the plane of both: they step aside instead of standing before each other."""
+    start = np.array([[[0.25, 0, 0, 1, 0, 0], [0, 0.25, 0, 1, 0, 0], [-0.3, -0.3, 0, 1, 0, 0]]])[:, :n_epm]
+    goal = start.copy()
+    goal[:, [0, 1]] = start[:, [1, 0]]
+    way = ways(System(n_epm=n_epm), start, goal, 600)
+    assert np.abs(way[-1] - goal).max() < 2e-9
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e3, "1"])
 @pytest.mark.parametrize("name", ["epm_speed_mps", "epm_turn_radps"])
-def test_speeds_must_be_positive(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"Input {name} must be a number above 0"):
+def test_speeds_must_be_positive_and_moderate(name: str, value: object) -> None:
+    """Of one alone without limit, or so fast that halfway is nowhere near, no plant can be made."""
+    with pytest.raises(ValueError, match="must be a number above 0 and at most"):
         dataclasses.replace(PLANT, **{name: value})
+
+
+@pytest.mark.parametrize("action", ["home", "pose", "step", "wrench"])
+def test_a_batch_equals_its_copies_and_single_episodes_in_every_mode(action: ActionMode) -> None:
+    arguments = {"scenario": "approach-60", "plant": "moving", "action": action, "control_hz": 20.0}
+    batch, single = TwoRobotsVector(6, **arguments), TwoRobots(**arguments)  # type: ignore[arg-type]
+    batch.reset(seed=0)
+    single.reset(seed=3)
+    size, twin = single.action_space.shape or (0,), None
+    for step in range(3):
+        actions = np.random.default_rng(step).uniform(-0.3, 0.3, (6, *size)).astype(np.float32)
+        if step == 1:
+            twin = pickle.loads(pickle.dumps(batch))
+        told = batch.step(actions)
+        assert told[0][3].tobytes() == single.step(actions[3])[0].tobytes()
+        if twin is not None:
+            assert told[0].tobytes() == twin.step(actions)[0].tobytes()
+        assert not told[2][3]
