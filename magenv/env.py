@@ -65,7 +65,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     |---|---|---|
     | ``scenario`` | ``random`` | ``random`` (training family), ``approach-<s>``, ``approach-<s>-anti``, s in mm |
     | ``plant`` | ``paper`` | EPMs jump to their commanded poses, no noise; ``moving``: they go there at 1 m/s and |
-    | | | 180 degrees/s, keep their least gap, and act on the robots on the way |
+    | | | 180 degrees/s at most, give way to each other, and act on the robots on the way |
     | ``n_epm`` | 2 | 2 or 3 |
     | ``action`` | ``home`` | see above |
     | ``observation`` | ``full`` | ``full`` or ``errors`` |

@@ -212,8 +212,8 @@ def test_speeds_must_be_positive_and_moderate(name: str, value: object) -> None:
         dataclasses.replace(PLANT, **{name: value})
 
 
-@pytest.mark.parametrize("action", ["home", "pose", "step", "wrench"])
-def test_a_batch_equals_its_copies_and_single_episodes_in_every_mode(action: ActionMode) -> None:
+@pytest.mark.parametrize("action", ["home", "wrench"])
+def test_a_batch_equals_its_copies_and_single_episodes(action: ActionMode) -> None:
     arguments = {"scenario": "approach-60", "plant": "moving", "action": action, "control_hz": 20.0}
     batch, single = TwoRobotsVector(6, **arguments), TwoRobots(**arguments)  # type: ignore[arg-type]
     batch.reset(seed=0)
