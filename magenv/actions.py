@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magenv.allocation import component_scales
 from magenv.home import home_epms, home_rows, start_rows
-from magenv.kernels import kernel
+from magenv.kernels import kernel, typed
 from magenv.params import System, require
 from magenv.poses import (
     EPM_SIZE,
@@ -50,7 +50,7 @@ WRENCH_TORQUE_NM = 0.001
 
 _FALLBACK_STARTS = 4
 _TOLERANCE = 1e-6
-_MAX_ITERATIONS = 60
+_MAX_ITERATIONS, _STOP_EARLY = typed(60), typed(True)
 
 
 @kernel
@@ -177,7 +177,7 @@ def wrench_rows(
             relative,
             _TOLERANCE,
             _MAX_ITERATIONS,
-            True,
+            _STOP_EARLY,
             poses,
             best_pose,
             best_wrench,
@@ -247,7 +247,7 @@ class Actions:
         """
         active = np.ones(len(epms), np.bool_) if active is None else active
         targets, projected = np.empty(epms.shape), np.empty(len(epms), np.bool_)
-        self.command(actions, measured, epms, active, targets, projected)
+        self.command(actions, np.ascontiguousarray(measured), np.ascontiguousarray(epms), active, targets, projected)
         return targets, projected
 
     def command(

@@ -289,7 +289,7 @@ def allocate_batch(
     shape = common_shape(target=u_d.shape[:-1], positions=p.shape[:-2], moments=m.shape[:-2], initial=warm.shape[:-1])
     own = ((WRENCH_SIZE,), (2, 3), (2, 3), warm.shape[-1:])
     u_d, p, m, warm = (
-        np.ascontiguousarray(np.broadcast_to(value, shape + end)).reshape(math.prod(shape), *end)
+        np.array(np.broadcast_to(value, shape + end), order="C").reshape(math.prod(shape), *end)
         for value, end in zip((u_d, p, m, warm), own, strict=True)
     )
     n, size = len(u_d), drawn.shape[1]

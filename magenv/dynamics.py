@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos
 from magenv.arithmetic import cross2, dot2, fma
-from magenv.dipole import SOURCE
+from magenv.dipole import SOURCE, dipole_parts
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     DECAY1,
@@ -43,7 +43,6 @@ from magenv.lanes import (
 )
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE
-from magenv.wrench import add_source, planar_wrench
 
 Floats = NDArray[np.float64]
 
@@ -87,6 +86,46 @@ class Physics(NamedTuple):
             body_diameter=body.diameter_m,
             wall_radius=plant.workspace_radius_m,
         )
+
+
+PlanarSums = tuple[float, float, float, float, float]
+"""What sources do to a robot in the plane: B_x, B_y (T), force per moment along it (T/m), F_x, F_y of the rest (N)."""
+
+
+@law
+def add_source(
+    sums: PlanarSums,
+    sx: float,
+    sy: float,
+    s_height: float,
+    nx: float,
+    ny: float,
+    rx: float,
+    ry: float,
+    height2: float,
+) -> PlanarSums:
+    """Return the sums with a source's share added, for a moment n in the plane at the offset (rx, ry) in the plane.
+
+    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``height2`` is the square of the source's
+    height and ``s_height`` minus the height times the strength's z component: all that enters of what is out of plane.
+    """
+    bx, by, along, fx, fy = sums
+    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, height2)), fma(sx, rx, fma(sy, ry, s_height)), dot2(nx, ny, rx, ry)
+    k, on_n, on_s, on_r = dipole_parts(r2, s_r, n_r, dot2(sx, sy, nx, ny))
+    return (
+        fma(on_n, rx, fma(k, sx, bx)),
+        fma(on_n, ry, fma(k, sy, by)),
+        along + on_n,
+        fma(on_r, rx, fma(on_s, sx, fx)),
+        fma(on_r, ry, fma(on_s, sy, fy)),
+    )
+
+
+@law
+def planar_wrench(sums: PlanarSums, nx: float, ny: float) -> tuple[float, float, float]:
+    """Return F_x, F_y (N) and tau_z (N m) of the sources summed up, on the moment n in the plane."""
+    bx, by, along, fx, fy = sums
+    return fma(along, nx, fx), fma(along, ny, fy), cross2(nx, ny, bx, by)
 
 
 @law

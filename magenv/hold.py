@@ -185,7 +185,7 @@ def hold_rows(
                     for j in range(CONSTANTS_SIZE):
                         lanes[CONSTANTS + j, i] = constants[row, j]
                     if travels:
-                        set_off(lanes, i, row, epm_moment[row], epms, targets)
+                        set_off(lanes, i, row, epm_moment[row], epms, targets, motion)
                     else:
                         jump(lanes, i, row, epm_moment[row], epms, targets)
                     which = trajectory_of(row, len(duration))
@@ -207,10 +207,10 @@ def hold_rows(
                 for i in range(width):
                     if flagged[i]:
                         give_way(lanes, i, n_epm, motion)
-            for i in range(width):
-                carry(lanes, i, n_epm, motion)
         rare = False
         for i in range(width):
+            if travels:
+                carry(lanes, i, n_epm)
             advance(lanes, i, n_epm, h)
             flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
             rare |= flagged[i]

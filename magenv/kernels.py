@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Number = TypeVar("Number", bool, int)
 
 
 _CONSTANTS = ("params", "kernels", "lanes")
@@ -67,6 +69,11 @@ def law(function: Function) -> Function:
     Only so can LLVM vectorise the loop; the law still stands once.
     """
     return _compile(function, inlined=True)
+
+
+def typed(value: Number) -> Number:
+    """Return a constant as a value of its type: a literal is a type of its own, for which all is compiled anew."""
+    return cast("Number", np.bool_(value) if isinstance(value, bool) else np.int64(value))
 
 
 def _wide_vectors(typing_context: Any) -> Any:

@@ -37,7 +37,7 @@ EPMS = 58
 """First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
 
 
-ROUTE_SIZE = 15
+ROUTE_SIZE = 35
 """Fields of an EPM of finite speed, see ``travel``."""
 
 

@@ -39,7 +39,7 @@ from magenv.interior import (
     try_step,
     update_duals,
 )
-from magenv.kernels import kernel
+from magenv.kernels import kernel, typed
 from magenv.poses import POSE_SIZE, clip_radius, epm_to_pose, pose_to_epm, project_epms
 from magenv.spheres import pose_to_points
 from magenv.wrench import N_ROBOTS, WRENCH_SIZE, robot_frames
@@ -58,7 +58,7 @@ _FIRST_DAMPING, _NEAR, _LEAST_DAMPING = 1e-2, 1e-2, 1e-12
 _DAMPING_FALL, _DAMPING_RISE, _DAMPING_TRIALS = 0.2, 4.0, 14
 _BARRIER_SHARE, _BARRIER_FALL, _BARRIER_END = 0.1, 0.2, 1e-8
 """The barrier's largest share of f, the factor by which it falls, its share of f at which a start is at rest."""
-_SLOW, _PATIENCE, _IMAGE_PATIENCE = 0.7, 6, 2
+_SLOW, _PATIENCE, _IMAGE_PATIENCE = 0.7, typed(6), typed(2)
 """Second derivatives are used once f has fallen to no less than this share in this many steps, one after another: late
 from a start, as Gauss-Newton steps keep nearer to it, soon from an image, as the target is probably out of reach."""
 _ATTEMPTS = 4
@@ -255,7 +255,7 @@ def best_of(
 ) -> tuple[float, int, int, int]:
     """Descend from every row of ``poses`` (M, 5 N); return the best half square, its status, iterations, starts run.
 
-    ``limits`` holds r_min, r_max and the gap. The starts are moved inside them in place. Where none meets the target,
+    ``limits`` holds r_min, r_max and the gap. The starts are moved inside them first. Where none meets the target,
     the best is a local minimum, and often an image of it lies in the basin of a better one: these are tried too.
     """
     n = poses.shape[1] // POSE_SIZE
@@ -265,8 +265,9 @@ def best_of(
     problem = Problem(target, positions, moments, frames, mutual, epm_moment, scale, r_min, r_max, gap)
     state, best, tried, model = new_state(n), new_state(n), new_state(n), new_model(n)
     best_cost, best_status, iterations, starts = math.inf, ITERATION_LIMIT, 0, 0
-    for pose in poses:
-        cost, status, count = _run(problem, tolerance, max_iterations, _PATIENCE, pose, state, model, tried)
+    for start in poses:
+        best_pose[:] = start
+        cost, status, count = _run(problem, tolerance, max_iterations, _PATIENCE, best_pose, state, model, tried)
         iterations += count
         starts += 1
         if cost < best_cost:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode, pose_rows, step_rows, wrench_rows
 from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
-from magenv.kernels import kernel
+from magenv.kernels import kernel, typed
 from magenv.starts import place_rows
 from magenv.state import State
 from magenv.task import observe_rows, reward_terms
@@ -36,6 +36,10 @@ def clip(numbers: Floats) -> bool:
         unfit += 0 if abs(numbers[i]) < math.inf else 1
         numbers[i] = min(max(numbers[i], -1.0), 1.0)
     return unfit == 0
+
+
+_ONLY = typed(0), typed(1)
+"""First and last of the only episode."""
 
 
 @kernel
@@ -243,7 +247,7 @@ def one_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Calla
             elif mode == "step":
                 _step(0, 1, s.every, s.action, s)
             else:
-                _wrench(0, 1, s.every, s.action, s)
+                _wrench(*_ONLY, s.every, s.action, s)
             _hold(0, 1, s.every, s, s.observation, *shape)
         paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
         return (

@@ -11,14 +11,12 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.arithmetic import cross2, dot2, fma
 from magenv.dipole import (
     dipole_field,
     dipole_force,
     dipole_force_gradient,
     dipole_force_hessian,
     dipole_gradient,
-    dipole_parts,
 )
 from magenv.kernels import kernel, law
 from magenv.params import common_shape, require
@@ -41,46 +39,6 @@ def dipole_wrench(
     bx, by, bz = dipole_field(sx, sy, sz, rx, ry, rz)
     fx, fy, fz = dipole_force(sx, sy, sz, mx, my, mz, rx, ry, rz)
     return my * bz - mz * by, mz * bx - mx * bz, mx * by - my * bx, fx, fy, fz
-
-
-PlanarSums = tuple[float, float, float, float, float]
-"""What sources do to a robot in the plane: B_x, B_y (T), force per moment along it (T/m), F_x, F_y of the rest (N)."""
-
-
-@law
-def add_source(
-    sums: PlanarSums,
-    sx: float,
-    sy: float,
-    s_height: float,
-    nx: float,
-    ny: float,
-    rx: float,
-    ry: float,
-    height2: float,
-) -> PlanarSums:
-    """Return the sums with a source's share added, for a moment n in the plane at the offset (rx, ry) in the plane.
-
-    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``height2`` is the square of the source's
-    height and ``s_height`` minus the height times the strength's z component: all that enters of what is out of plane.
-    """
-    bx, by, along, fx, fy = sums
-    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, height2)), fma(sx, rx, fma(sy, ry, s_height)), dot2(nx, ny, rx, ry)
-    k, on_n, on_s, on_r = dipole_parts(r2, s_r, n_r, dot2(sx, sy, nx, ny))
-    return (
-        fma(on_n, rx, fma(k, sx, bx)),
-        fma(on_n, ry, fma(k, sy, by)),
-        along + on_n,
-        fma(on_r, rx, fma(on_s, sx, fx)),
-        fma(on_r, ry, fma(on_s, sy, fy)),
-    )
-
-
-@law
-def planar_wrench(sums: PlanarSums, nx: float, ny: float) -> tuple[float, float, float]:
-    """Return F_x, F_y (N) and tau_z (N m) of the sources summed up, on the moment n in the plane."""
-    bx, by, along, fx, fy = sums
-    return fma(along, nx, fx), fma(along, ny, fy), cross2(nx, ny, bx, by)
 
 
 @kernel

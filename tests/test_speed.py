@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from magenv.allocation import allocate, allocate_batch
 from magenv.env import TwoRobots
 from magenv.hold import hold_rows, hold_shape
 from magenv.params import System, TaskParams
+from magenv.solver import best_of, descend
 from magenv.trajectories import approach
 from magenv.vector_env import TwoRobotsVector
 from magenv.workers import Workers
@@ -210,3 +212,16 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 @pytest.mark.skipif(platform.system() == "Windows", reason="needs fork")
 def test_a_fork_after_a_threaded_step_works() -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], check=True, timeout=120)
+
+
+def test_the_solver_is_compiled_once_for_all_who_call_it() -> None:
+    """Half a minute each: for one allocation, for many, for the wrench action of one episode and of many."""
+    positions, moments = [[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], [[0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]
+    allocate(np.full(10, 1e-4), positions, moments, System(), starts=1)
+    allocate_batch(np.full((2, 10), 1e-4), positions, moments, System(), starts=1)
+    one, many = TwoRobots(action="wrench"), TwoRobotsVector(5, action="wrench")
+    one.reset(seed=0)
+    one.step(np.zeros(6, np.float32))
+    many.reset(seed=0)
+    many.step(np.zeros((5, 6), np.float32))
+    assert len(best_of.nopython_signatures) == len(descend.nopython_signatures) == 1  # type: ignore[attr-defined]

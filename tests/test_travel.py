@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
 from lane import magnets
 from numpy.typing import NDArray
 
-from magenv.actions import ActionMode
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.poses import from_cartesian
@@ -66,10 +66,9 @@ def test_limits_hold_all_the_way(rng: np.random.Generator, n_epm: int) -> None:
     assert radii.max() < system.r_max_m + 1e-9
     np.testing.assert_allclose(np.linalg.norm(moments, axis=-1), 1.0, atol=1e-12)
     moved = np.linalg.norm(np.diff(centres, axis=0), axis=-1)
-    assert moved.max() < PLANT.epm_speed_mps * H * 1.001
+    assert moved.max() < PLANT.epm_speed_mps * H * (1.0 + 1e-8)
     assert moved.max() > PLANT.epm_speed_mps * H * 0.99
-    turned = angle(moments[1:], moments[:-1])
-    assert turned.max() == pytest.approx(PLANT.epm_turn_radps * H, rel=1e-6)
+    assert angle(moments[1:], moments[:-1]).max() == pytest.approx(PLANT.epm_turn_radps * H, rel=1e-6)
     for k in range(n_epm):
         for j in range(k):
             gaps = np.linalg.norm(centres[:, :, k] - centres[:, :, j], axis=-1)
@@ -89,24 +88,43 @@ def test_epms_arrive_and_stay(rng: np.random.Generator, n_epm: int) -> None:
     np.testing.assert_allclose(way[-2][there], way[-1][there], rtol=0, atol=1e-9)
 
 
-def test_a_way_is_a_great_circle_at_full_speed(rng: np.random.Generator) -> None:
-    """One EPM goes, the other rests far away: in one plane with start and goal, the radius in step with the angle."""
-    system, plant = System(), PLANT
-    starts = np.tile([[0.2, 0, 0, 1, 0, 0], [-0.5, 0, 0, 1, 0, 0]], (1, 1, 1)).astype(np.float64)
-    goals = starts.copy()
-    goals[0, 0] = [0.0, 0.3 * math.cos(0.5), 0.3 * math.sin(0.5), 0.0, 1.0, 0.0]
-    way = ways(system, starts, goals, 400)[:, 0, 0]
-    last = int(np.flatnonzero((way[:, :3] == goals[0, 0, :3]).all(axis=1))[0])
-    normal = np.cross(starts[0, 0, :3], goals[0, 0, :3])
-    assert np.abs(way[:, :3] @ normal).max() < 1e-12
-    radii, around = np.linalg.norm(way[:, :3], axis=1), angle(way[:, :3], starts[0, 0, :3])
-    share = around[:last] / (0.5 * math.pi)
-    np.testing.assert_allclose(radii[:last], 0.2 + 0.1 * share, atol=1e-5)
-    steps = np.linalg.norm(np.diff(way[:last, :3], axis=0), axis=1)
-    np.testing.assert_allclose(steps, plant.epm_speed_mps * H, rtol=1e-3)
-    quarter = 0.5 * math.pi / plant.epm_turn_radps
-    aligned = int(np.flatnonzero((way[:, 3:] == goals[0, 0, 3:]).all(axis=1))[0])
-    assert aligned == math.ceil(quarter / H - 1e-9)
+def turned(start: Floats, goal: Floats, share: Floats) -> Floats:
+    """Unit vectors (n, ..., 3) at shares (n,) of the shortest way from start to goal (..., 3)."""
+    between = angle(start, goal)[..., None]
+    share = share.reshape(-1, *([1] * start.ndim))
+    return (np.sin((1.0 - share) * between) * start + np.sin(share * between) * goal) / np.sin(between)
+
+
+def evenly(start: Floats, goal: Floats, times: Floats) -> tuple[Floats, float]:
+    """One EPM (6,) on its way at given times (s): radius and angle in step, top speed where the radius is largest.
+
+    Also the time (s) at which its centre arrives.
+    """
+    near, far = np.linalg.norm(start[:3]), np.linalg.norm(goal[:3])
+    around = angle(start[:3], goal[:3])
+    takes = math.hypot(max(near, far) * around, far - near) / PLANT.epm_speed_mps
+    turns = angle(start[3:], goal[3:]) / PLANT.epm_turn_radps
+    share = np.minimum(times / takes, 1.0)
+    radii = (near + share * (far - near))[:, None]
+    centres = radii * turned(start[:3] / near, goal[:3] / far, share)
+    return np.concatenate([centres, turned(start[3:], goal[3:], np.minimum(times / turns, 1.0))], axis=1), takes
+
+
+def test_a_way_is_a_great_circle_gone_evenly() -> None:
+    """One EPM goes, the other rests far away; the hold ends at the substep at which it arrives, and before."""
+    start = np.array([[0.2, 0, 0, 1, 0, 0], [-0.5, 0, 0, 1, 0, 0]], dtype=np.float64)
+    goal = start.copy()
+    goal[0] = [0.0, 0.3 * math.cos(0.5), 0.3 * math.sin(0.5), 0.0, 1.0, 0.0]
+    takes = evenly(start[0], goal[0], np.zeros(1))[1]
+    last = math.ceil(takes / H)
+    for substeps in (1, 2, 40, last - 1, last, last + 3):
+        task = TaskParams(control_hz=1.0 / (substeps * H), loss_distance_m=10.0)
+        world = world_of(System(), start[None], PLANT, task)
+        assert world.substeps == substeps
+        world.step(goal[None], np.ones(1, np.bool_))
+        expected = evenly(start[0], goal[0], np.array([substeps * H]))[0][0]
+        np.testing.assert_allclose(world.epms[0, 0], expected, rtol=0, atol=1e-13)
+        assert (world.epms[0, 0, :3] == goal[0, :3]).all() == (substeps >= last)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -129,21 +147,20 @@ def test_epms_act_on_the_way(rng: np.random.Generator) -> None:
     )
     system, task = System(), TaskParams(loss_distance_m=10.0)
     starts, goals = (np.array([magnets(rng, system) for _ in range(20)]) for _ in range(2))
-    fine = dataclasses.replace(heavy, substep_s=H / 10)
     world = world_of(system, starts, heavy, task)
     world.step(goals, np.ones(20, np.bool_))
-    way = ways(system, starts, goals, 100, fine)
+    times = np.linspace(0.0, task.period_s, 1001)
     robots = world_of(system, starts).robots[0, :, :3]
     positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=1)
     moments = planar_moments(robots[:, 2], system.ipm_moment_am2)
-    apart = np.linalg.norm(way[:, :, 0, :3] - way[:, :, 1, :3], axis=-1).min(axis=0)
-    free = np.flatnonzero(apart > system.gap_min_m + 0.01)  # where they give way, it depends on the substep how
-    assert len(free) > 5
-    for row in free:
-        # ten substeps a hold of 5 ms: way[k] is at 5 ms k
-        poses = from_cartesian(way[:, row, :, :3], way[:, row, :, 3:])
-        u = robot_wrench(positions, moments, poses, system.epm_moment_am2)
-        impulse, most = np.trapezoid(u, dx=H, axis=0), np.trapezoid(np.abs(u), dx=H, axis=0)
+    free = 0
+    for row in range(20):
+        way = np.stack([evenly(starts[row, k], goals[row, k], times)[0] for k in range(2)], axis=1)
+        if np.linalg.norm(way[:, 0, :3] - way[:, 1, :3], axis=-1).min() < system.gap_min_m:
+            continue  # they give way to each other
+        free += 1
+        u = robot_wrench(positions, moments, from_cartesian(way[..., :3], way[..., 3:]), system.epm_moment_am2)
+        impulse, most = np.trapezoid(u, times, axis=0), np.trapezoid(np.abs(u), times, axis=0)
         for robot in range(2):
             c, s = np.cos(robots[robot, 2]), np.sin(robots[robot, 2])
             _, torque, along, across, _ = impulse[5 * robot : 5 * robot + 5]
@@ -151,6 +168,7 @@ def test_epms_act_on_the_way(rng: np.random.Generator) -> None:
             got = np.array([rate, c * vx + s * vy, c * vy - s * vx])
             off, scale = np.abs(got - [torque, along, across]), most[5 * robot + 1 : 5 * robot + 4]
             np.testing.assert_array_less(off, 5e-3 * scale)  # 0.1 % of speed is 0.1 mm of way
+    assert free > 5
 
 
 def test_commands_far_away_act_late(rng: np.random.Generator) -> None:
@@ -179,8 +197,7 @@ def test_moments_stay_unit_vectors_whatever_is_commanded(rng: np.random.Generato
         before = world.epms.copy()
         world.step(goals, np.ones(20, np.bool_))
         np.testing.assert_allclose(np.linalg.norm(world.epms[..., 3:], axis=-1), 1.0, atol=1e-14)
-        turned = angle(before[..., 3:], world.epms[..., 3:])
-        np.testing.assert_allclose(turned, PLANT.epm_turn_radps * H, rtol=1e-6)
+        np.testing.assert_allclose(angle(before[..., 3:], world.epms[..., 3:]), PLANT.epm_turn_radps * H, rtol=1e-6)
 
 
 def test_the_last_substep_is_no_faster() -> None:
@@ -191,7 +208,7 @@ def test_the_last_substep_is_no_faster() -> None:
     goal = start.copy()
     goal[0, 0, :2] = (0.15 + out) * math.cos(around), (0.15 + out) * math.sin(around)
     way = ways(System(), start, goal, 3)[:, 0, 0, :3]
-    assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < reach * 1.0005
+    assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < reach * (1.0 + 1e-8)
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])
@@ -212,10 +229,9 @@ def test_speeds_must_be_positive_and_moderate(name: str, value: object) -> None:
         dataclasses.replace(PLANT, **{name: value})
 
 
-@pytest.mark.parametrize("action", ["home", "wrench"])
-def test_a_batch_equals_its_copies_and_single_episodes(action: ActionMode) -> None:
-    arguments = {"scenario": "approach-60", "plant": "moving", "action": action, "control_hz": 20.0}
-    batch, single = TwoRobotsVector(6, **arguments), TwoRobots(**arguments)  # type: ignore[arg-type]
+def test_a_batch_equals_its_copies_and_single_episodes() -> None:
+    arguments: dict[str, Any] = {"scenario": "approach-60", "plant": "moving", "control_hz": 20.0}
+    batch, single = TwoRobotsVector(6, **arguments), TwoRobots(**arguments)
     batch.reset(seed=0)
     single.reset(seed=3)
     size, twin = single.action_space.shape or (0,), None
