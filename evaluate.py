@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agents.catalogue import controller, defaults, names
-from agents.command import command_line, friendly, parse
 from agents.comparison import compare
+from magenv.command import command_line, friendly, parse
 
 
 @dataclass(frozen=True)

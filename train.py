@@ -11,11 +11,11 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends t
 
 from agents.catalogue import controller
 from agents.checkpoints import stored_config
-from agents.command import command_line, friendly, parse
 from agents.comparison import compare
 from agents.configs import TrainConfig
 from agents.learned import Learned
 from agents.learning import train
+from magenv.command import command_line, friendly, parse
 
 EPISODES = 20
 SCENARIOS = ("approach-60", "approach-30")

@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from agents.controller import Controller
-from agents.records import Record, check_output_dir
+from agents.records import Record
 from agents.report import file_name, print_table, write_report
 from agents.rollout import run
 from magenv.episodes import Episodes, Settings
+from magenv.files import check_output_dir
 from magenv.params import require
 
 SEED_MAX = 2**32 - 1

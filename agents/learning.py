@@ -23,9 +23,9 @@ from agents.checkpoints import check_goes_on, checkpoints, restore, save_model
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import CLIP_OBSERVATION, policy_kwargs
 from agents.progress import Reporter, logger
-from agents.records import check_output_dir
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import check_replaceable
+from magenv.files import check_output_dir
 from magenv.params import InputError
 
 DEFAULT_FOLDER = Path("runs/train")

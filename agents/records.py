@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import tempfile
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.files import write_file
 from magenv.params import InputError, require
 
 Floats = NDArray[np.float64]
@@ -81,34 +80,6 @@ _SCALARS: dict[str, type] = {
 _STATES = ("time_s", "robots", "epm_pose")
 _REFERENCE = "reference"
 _HOLDS = tuple(f.name for f in fields(Record) if f.name not in (*_SCALARS, *_STATES, _REFERENCE))
-
-
-def check_output_dir(folder: Path) -> None:
-    """Make the folder and prove that it can be written, before anything is computed for it.
-
-    Raises
-    ------
-    ValueError
-        If it cannot.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(
-            f"Input out must be a folder that can be written; instead received {str(folder)!r} ({error.strerror})."
-        ) from error
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write ``content`` to a new name beside ``path`` and move it into place: never half a file."""
-    new = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        new.write_bytes(content)
-        os.replace(new, path)
-    finally:
-        new.unlink(missing_ok=True)
 
 
 def save(records: list[Record], path: Path) -> None:

@@ -18,8 +18,9 @@ from rich.text import Text
 
 from agents import figures
 from agents.metrics import Episode, Interval, Summary, by_controller, by_scenario, measure, summarise
-from agents.records import Record, check_output_dir, save, write_file
+from agents.records import Record, save
 from agents.replay import animate
+from magenv.files import check_output_dir, write_file
 from magenv.params import require
 
 PAPER = {

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from agents.baseline import Baseline
-from agents.command import friendly, parse
 from agents.metrics import measure
 from agents.pid import Gains
 from agents.rollout import run
+from magenv.command import friendly, parse
 from magenv.params import require
 
 START = Gains(force_p=0.1, force_i=0.005, force_d=0.01, torque_p=6e-5, torque_i=1e-6, torque_d=1e-6)

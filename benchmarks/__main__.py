@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from agents.command import friendly, parse
-from agents.records import check_output_dir, write_file
 from benchmarks import allocation, dipole, env, memory, rollouts, start
 from benchmarks.machine import head
 from benchmarks.measure import Effort
 from benchmarks.table import Line, Row, console, page
+from magenv.command import friendly, parse
+from magenv.files import check_output_dir, write_file
 from magenv.params import require
 
 Part = Literal["env", "dipole", "sb3", "allocation", "start", "memory"]

@@ -35,7 +35,7 @@ from magenv.poses import (
     project_epms,
     robots_frame,
 )
-from magenv.solver import best_of
+from magenv.solver import best_of, relative_scale
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 
@@ -156,12 +156,7 @@ def wrench_rows(
             for j in range(3):
                 wrench[3 * robot + j] = actions[i, 3 * robot + j] * (WRENCH_TORQUE_NM if j == 2 else WRENCH_FORCE_N)
         planar_target(wrench, measured[i, 0, 2], measured[i, 1, 2], target)
-        norm = 0.0
-        for j in range(WRENCH_SIZE):
-            norm += (scale[j] * target[j]) ** 2
-        norm = max(math.sqrt(norm), 1e-6)
-        for j in range(WRENCH_SIZE):
-            relative[j] = scale[j] / norm
+        relative_scale(target, scale, relative)
         poses = starts.copy()
         frame = robots_frame(measured[i, 0, 2], measured[i, 1, 2])
         for k in range(n_epm):

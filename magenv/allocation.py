@@ -8,6 +8,7 @@ starts; the best is kept (``magenv.solver``).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -18,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from magenv.allocation_input import check_limits, checked_problem, draw_starts
 from magenv.allocation_scipy import ScipyMethod, scipy_best_of
 from magenv.kernels import kernel
-from magenv.params import System, common_shape, require
-from magenv.solver import best_of
+from magenv.params import System, common_shape, is_whole, require
+from magenv.solver import best_of, relative_scale
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 
@@ -31,9 +32,6 @@ TORQUE_SCALE_NM = 0.05
 """The paper's targets: what a residual is measured against."""
 STATUSES = ("converged", "stationary", "iteration_limit")
 """``converged``: the target is met within the tolerance; ``stationary``: a local minimum that misses it."""
-
-_NORM_FLOOR = 1e-6
-"""Scaled targets smaller than this count as this large: half a micronewton."""
 
 
 @dataclass(frozen=True)
@@ -82,23 +80,18 @@ def component_scales(force_scale_n: float = FORCE_SCALE_N, torque_scale_nm: floa
     return np.array(robot + robot)
 
 
-@kernel
-def _scale_errors(target: Floats, force_scale_n: float, torque_scale_nm: float, scale: Floats) -> float:
-    """Write S over the norm of the scaled target (10,), by which errors become relative; return that norm."""
-    squared = 0.0
-    for i in range(WRENCH_SIZE):
-        scale[i] = 1.0 / (torque_scale_nm if i % 5 < 2 else force_scale_n)
-        squared += (scale[i] * target[i]) ** 2
-    norm = max(math.sqrt(squared), _NORM_FLOOR)
-    for i in range(WRENCH_SIZE):
-        scale[i] /= norm
-    return norm
-
-
-def _check_scales(force_scale_n: float, torque_scale_nm: float) -> None:
+def _weights(force_scale_n: float, torque_scale_nm: float, components: Sequence[int] | None) -> Floats:
+    """Return one over the scale of each component that counts, zero for the others (10)."""
     for name, number in (("force_scale_n", force_scale_n), ("torque_scale_nm", torque_scale_nm)):
         fits = isinstance(number, (int, float, np.number)) and 1e-9 <= number <= 1e9
         require(fits, name, "a number from 1e-9 to 1e9", number)
+    weights: Floats = 1.0 / component_scales(float(force_scale_n), float(torque_scale_nm))
+    if components is None:
+        return weights
+    chosen = list(components)
+    fits = len(chosen) > 0 and all(is_whole(i) and 0 <= i < WRENCH_SIZE for i in chosen)
+    require(fits, "components", f"indices from 0 to {WRENCH_SIZE - 1}, one at least", components)
+    return np.where(np.isin(np.arange(WRENCH_SIZE), chosen), weights, 0.0)
 
 
 def _limits(system: System) -> Floats:
@@ -114,8 +107,7 @@ def _allocate_rows(
     moments: Floats,
     epm_moment: float,
     limits: Floats,
-    force_scale_n: float,
-    torque_scale_nm: float,
+    weights: Floats,
     tolerance: float,
     max_iterations: int,
     stop_early: bool,
@@ -142,7 +134,7 @@ def _allocate_rows(
             starts[0] = initial[i]
         starts[warm:] = random
         target[:], position[:], moment[:] = targets[i], positions[i], moments[i]
-        norms[i] = _scale_errors(target, force_scale_n, torque_scale_nm, scale)
+        norms[i] = relative_scale(target, weights, scale)
         cost, counts[i, 0], counts[i, 1], counts[i, 2] = best_of(
             target,
             position,
@@ -175,6 +167,7 @@ def allocate(
     max_iterations: int = 200,
     force_scale_n: float = FORCE_SCALE_N,
     torque_scale_nm: float = TORQUE_SCALE_NM,
+    components: Sequence[int] | None = None,
     method: Method = "interior-point",
 ) -> Solution:
     """Find EPM poses whose wrench on the robots comes nearest to the target.
@@ -199,6 +192,8 @@ def allocate(
         Limit per start.
     force_scale_n, torque_scale_nm : float
         What forces and torques are divided by.
+    components : sequence of int, optional
+        Indices of the components of U that count, the others being borne by something else; without, all.
     method : {"interior-point", "trust-constr", "SLSQP"}
         Ours, or SciPy's interior point or sequential least squares on the same problem and starts, as slow references.
 
@@ -216,11 +211,11 @@ def allocate(
     require(known, "method", "interior-point, trust-constr or SLSQP", method)
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=False)
     check_limits(tolerance, max_iterations)
-    _check_scales(force_scale_n, torque_scale_nm)
+    weights = _weights(force_scale_n, torque_scale_nm, components)
     poses = draw_starts(system, starts, seed, first is not None)
     poses = poses.copy() if first is None else np.concatenate([first[None], poses])
     best_pose, best_wrench, scale = np.empty(poses.shape[1]), np.empty(WRENCH_SIZE), np.empty(WRENCH_SIZE)
-    norm = _scale_errors(u_d, float(force_scale_n), float(torque_scale_nm), scale)
+    norm = relative_scale(u_d, weights, scale)
     solve = best_of if method == "interior-point" else partial(scipy_best_of, method)
     cost, status, iterations, run = solve(
         u_d,
@@ -254,6 +249,7 @@ def allocate_batch(
     max_iterations: int = 200,
     force_scale_n: float = FORCE_SCALE_N,
     torque_scale_nm: float = TORQUE_SCALE_NM,
+    components: Sequence[int] | None = None,
     threads: int = 1,
 ) -> Solutions:
     """Solve many allocations in one call, each with the bits that ``allocate`` gives it alone with the same seed.
@@ -264,7 +260,7 @@ def allocate_batch(
         Desired U_d, N m and N.
     positions, moments : array_like, shape (..., 2, 3)
         Robots' positions in m and moments in A m^2. The leading axes of all inputs broadcast.
-    system, starts, seed, stop_early, tolerance, max_iterations, force_scale_n, torque_scale_nm
+    system, starts, seed, stop_early, tolerance, max_iterations, force_scale_n, torque_scale_nm, components
         As in ``allocate``; all targets share the random starts.
     initial : array_like, shape (..., 5 N), optional
         Warm starts, tried before the random ones.
@@ -283,7 +279,7 @@ def allocate_batch(
     """
     u_d, p, m, first = checked_problem(target, positions, moments, initial, system, leading=True)
     check_limits(tolerance, max_iterations)
-    _check_scales(force_scale_n, torque_scale_nm)
+    weights = _weights(force_scale_n, torque_scale_nm, components)
     drawn = draw_starts(system, starts, seed, first is not None)
     warm = np.empty(0) if first is None else first
     shape = common_shape(target=u_d.shape[:-1], positions=p.shape[:-2], moments=m.shape[:-2], initial=warm.shape[:-1])
@@ -303,8 +299,7 @@ def allocate_batch(
         m,
         system.epm_moment_am2,
         _limits(system),
-        float(force_scale_n),
-        float(torque_scale_nm),
+        weights,
         tolerance,
         max_iterations,
         stop_early,

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.margins import gap_margins
 from magenv.poses import POSE_SIZE, from_cartesian, to_cartesian
 from magenv.solver import CONVERGED, ITERATION_LIMIT, STATIONARY, make_interior
 from magenv.wrench import robot_wrench, wrench_jacobian
@@ -46,7 +47,6 @@ def scipy_best_of(
 
     r_min, r_max, gap = (float(limit) for limit in limits)
     size = poses.shape[1]
-    first, second = np.triu_indices(size // POSE_SIZE, 1)
 
     def error(x: Floats) -> Floats:
         return scale * (robot_wrench(positions, moments, x, epm_moment) - target)
@@ -59,26 +59,13 @@ def scipy_best_of(
         return np.asarray(jacobian.T @ error(x))
 
     def gaps(x: Floats) -> Floats:
-        centres, _ = to_cartesian(x)
-        squared: Floats = np.sum((centres[first] - centres[second]) ** 2, axis=-1)
-        return (squared - gap**2) / (2 * gap)
-
-    def gap_slopes(x: Floats) -> Floats:
-        centres, _ = to_cartesian(x)
-        slopes = np.zeros((len(first), size))
-        for k, (azimuth, _, radius) in enumerate(x.reshape(-1, POSE_SIZE)[:, :3]):
-            px, py, pz = centres[k]
-            along = np.hypot(px, py)
-            raised = [-pz * np.cos(azimuth), -pz * np.sin(azimuth), along]
-            moves = np.array([[-py, px, 0.0], raised, centres[k] / radius])
-            for pair in np.flatnonzero((first == k) | (second == k)):
-                other = second[pair] if first[pair] == k else first[pair]
-                slopes[pair, POSE_SIZE * k : POSE_SIZE * k + 3] = moves @ (centres[k] - centres[other]) / gap
-        return slopes
+        return gap_margins(x, gap)[0]
 
     low, high = np.full(size, -np.inf), np.full(size, np.inf)
     low[2::POSE_SIZE], high[2::POSE_SIZE] = r_min, r_max
-    constraints = [NonlinearConstraint(gaps, 0.0, np.inf, jac=gap_slopes)] if len(first) else []
+    constraints = (
+        [NonlinearConstraint(gaps, 0.0, np.inf, jac=lambda x: gap_margins(x, gap)[1])] if size > POSE_SIZE else []
+    )
     options: Any = {"maxiter": max_iterations, **_ENDS[method]}
     best, status, iterations, run = math.inf, ITERATION_LIMIT, 0, 0
     for start in poses:
@@ -99,7 +86,7 @@ def scipy_best_of(
             )
         iterations += int(result.nit)
         run += 1
-        if result.fun < best and gaps(result.x).min(initial=math.inf) >= -_FEASIBLE_M:
+        if result.fun < best and gaps(result.x).min(initial=math.inf) >= -_FEASIBLE_M / gap:
             best = float(result.fun)
             at_rest = STATIONARY if result.success else ITERATION_LIMIT
             status = CONVERGED if 2 * best <= tolerance**2 else at_rest

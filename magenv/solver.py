@@ -48,6 +48,8 @@ Floats = NDArray[np.float64]
 
 CONVERGED, STATIONARY, ITERATION_LIMIT = 0, 1, 2
 
+NORM_FLOOR = 1e-6
+"""Scaled targets smaller than this count as this large: half a micronewton."""
 _MARGIN = 1e-3
 """Starts are moved inside the constraints by this share of their size."""
 _LARGEST_PUSH = 1.01
@@ -236,6 +238,21 @@ def _image(which: int, epms: Floats, pose: Floats) -> None:
             image[i] = -epms[k, i] if at_centre or (which == 0 and i == 2) else epms[k, i]
             image[3 + i] = -epms[k, 3 + i] if of_moment or (which == 0 and i == 2) else epms[k, 3 + i]
         epm_to_pose(image, pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
+
+
+@kernel
+def relative_scale(target: Floats, weights: Floats, scale: Floats) -> float:
+    """Write into ``scale`` (10,) by what errors are multiplied to be relative to the target (10,); return its norm.
+
+    ``weights`` (10,) are one over what each component is measured in, or zero where it does not count.
+    """
+    squared = 0.0
+    for i in range(WRENCH_SIZE):
+        squared += (weights[i] * target[i]) ** 2
+    norm = max(math.sqrt(squared), NORM_FLOOR)
+    for i in range(WRENCH_SIZE):
+        scale[i] = weights[i] / norm
+    return norm
 
 
 @kernel

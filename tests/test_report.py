@@ -22,7 +22,8 @@ from agents import figures
 from agents.metrics import Episode, summarise
 from agents.records import Record, load
 from agents.replay import PANELS, animate
-from agents.report import check_output_dir, print_table, write_report
+from agents.report import print_table, write_report
+from magenv.files import check_output_dir
 
 LOST = (30, 24, 36)
 

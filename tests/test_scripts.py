@@ -19,10 +19,10 @@ import pytest
 from tiny_runs import OPTIONS
 
 from agents.checkpoints import checkpoints, stored_config
-from agents.command import friendly
 from agents.learned import Learned
 from agents.learning import train
 from agents.store import load_card
+from magenv.command import friendly
 from magenv.params import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -31,7 +31,7 @@ SHORT = """
 import sys
 sys.argv[0] = "train.py"
 import train
-from agents.command import friendly
+from magenv.command import friendly
 train.EPISODES, train.SCENARIOS = 1, ("approach-60",)
 friendly(train.main)
 """

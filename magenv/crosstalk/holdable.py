@@ -1,0 +1,136 @@
+"""Holdable separation: how close two robots can be held still, each one's whole wrench zero against the mutual one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.allocation import Solution, allocate, component_scales
+from magenv.crosstalk.activation import Pair, is_positive
+from magenv.params import System, require
+from magenv.wrench import WRENCH_SIZE, robot_frames
+
+Floats = NDArray[np.float64]
+
+IN_PLANE = (1, 2, 3, 6, 7, 8)
+"""Indices into U of what moves robots in their plane: tau_z, F_x, F_y of each. The rest is borne by the plane."""
+HELD = 1e-6
+"""Share of the robots' mutual wrench that may be left over in a hold."""
+_NO_TARGET = 1e-6
+"""Norm by which ``allocate`` divides residuals where the target is zero."""
+_STEP = 0.94
+"""Factor from one distance to the next on the way down: one half in eleven steps."""
+
+
+def _mutual_wrench(pair: Pair, system: System) -> float:
+    """Return the norm of what the robots do to each other, in the paper's targets."""
+    frames, mutual = np.empty((2, 3, 3)), np.empty(WRENCH_SIZE)
+    robot_frames(pair.positions, pair.moments(system), frames, mutual)
+    return float(np.linalg.norm(mutual / component_scales()))
+
+
+def hold(
+    pair: Pair,
+    system: System,
+    *,
+    components: Sequence[int] | None = None,
+    starts: int = 10,
+    seed: int = 0,
+    initial: Floats | None = None,
+) -> Solution | None:
+    """Return EPM poses that leave no wrench on either robot, in none of the ten components; None where none is found.
+
+    Parameters
+    ----------
+    pair : Pair
+        The robots.
+    system : System
+        Magnets and limits.
+    components : sequence of int, optional
+        The components that must vanish, such as ``IN_PLANE``; without, all ten.
+    starts, seed : int
+        Random starts and their seed; the first that holds ends the search.
+    initial : ndarray, shape (5 N,), optional
+        Poses to begin with.
+    """
+    tolerance = HELD * _mutual_wrench(pair, system) / _NO_TARGET
+    found = allocate(
+        np.zeros(WRENCH_SIZE),
+        pair.positions,
+        pair.moments(system),
+        system,
+        starts=starts,
+        seed=seed,
+        initial=initial,
+        stop_early=True,
+        tolerance=tolerance,
+        components=components,
+    )
+    return found if found.relative_residual <= tolerance else None
+
+
+def holdable_separation(
+    pair: Pair,
+    system: System,
+    *,
+    components: Sequence[int] | None = None,
+    nearest_m: float = 0.011,
+    precision_m: float = 5e-5,
+    starts: int = 50,
+    seed: int = 0,
+) -> float:
+    """Return the smallest distance (m) at which the pair can be held, going nearer from its own distance.
+
+    Parameters
+    ----------
+    pair : Pair
+        The robots, as far apart as the search begins.
+    system : System
+        Magnets and limits.
+    components : sequence of int, optional
+        As in ``hold``.
+    nearest_m : float
+        Where it ends: the bodies' width.
+    precision_m : float
+        To which the last distance is bisected.
+    starts, seed : int
+        Random starts at each distance, beside the poses that held at the last.
+
+    Returns
+    -------
+    float
+        NaN where the pair cannot be held even at its own distance; ``nearest_m`` where it can be all the way.
+
+    Raises
+    ------
+    ValueError
+        If ``nearest_m`` is not less than the pair's distance, or the precision is not positive.
+    """
+    fits = is_positive(nearest_m) and nearest_m < pair.distance_m
+    require(fits, "nearest_m", f"positive and less than the distance {pair.distance_m}", nearest_m)
+    require(is_positive(precision_m), "precision_m", "a positive, finite number", precision_m)
+    found = hold(pair, system, components=components, starts=starts, seed=seed)
+    if found is None:
+        return math.nan
+    held, lost = pair.distance_m, None
+    while lost is None or held - lost > precision_m:
+        trial = max(_STEP * held, nearest_m) if lost is None else 0.5 * (held + lost)
+        nearer = hold(
+            replace(pair, distance_m=trial),
+            system,
+            components=components,
+            starts=starts,
+            seed=seed,
+            initial=found.pose,
+        )
+        if nearer is None:
+            lost = trial
+            continue
+        held, found = trial, nearer
+        if held == nearest_m:
+            break
+    return held

@@ -1,0 +1,149 @@
+"""Many independent tasks through joblib, each kept as it is done, so that a stopped run goes on where it was."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from magenv.crosstalk.tasks import TASKS, Row
+from magenv.files import write_file
+from magenv.params import InputError
+
+Engine = Literal["local", "dask", "ray"]
+
+_A_ROUND = 16
+"""Tasks a worker computes between two looks at what is done: few enough that little is lost, and many enough that
+workers seldom wait for each other."""
+
+
+class Task(NamedTuple):
+    """A point of a sweep: the table that it fills and the arguments of its function in ``tasks.TASKS``."""
+
+    table: str
+    arguments: dict[str, Any]
+
+    def key(self) -> str:
+        """Return what names the result: arguments and all source code of which it may depend."""
+        told = json.dumps([self.table, self.arguments, _sources()], sort_keys=True)
+        return f"{self.table}-{hashlib.sha256(told.encode()).hexdigest()[:24]}"
+
+
+_digest: list[str] = []
+
+
+def _sources() -> str:
+    if not _digest:
+        total = hashlib.sha256()
+        package = Path(__file__).parent.parent
+        for path in sorted(package.rglob("*.py")):
+            total.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+        _digest.append(total.hexdigest())
+    return _digest[0]
+
+
+def compute(task: Task) -> list[Row]:
+    """Return the rows of a task."""
+    return TASKS[task.table](**task.arguments)
+
+
+@contextlib.contextmanager
+def _backend(engine: Engine, workers: int) -> Iterator[None]:
+    """Let joblib use the processes of this machine, or a cluster: Dask's of ``DASK_SCHEDULER_ADDRESS``, Ray's own."""
+    with contextlib.ExitStack() as stack:
+        if engine == "local":
+            stack.enter_context(joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1))
+        elif engine == "dask":
+            try:
+                from distributed import Client, LocalCluster
+            except ImportError as error:
+                raise InputError(
+                    "Input engine must be one whose package is installed, python -m pip install distributed; "
+                    "instead received 'dask'."
+                ) from error
+            address = os.environ.get("DASK_SCHEDULER_ADDRESS")
+            if address is None:
+                address = stack.enter_context(
+                    LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+                )
+            stack.enter_context(Client(address))
+            stack.enter_context(joblib.parallel_config(backend="dask"))
+        else:
+            try:
+                import ray
+                from ray.util.joblib import register_ray
+            except ImportError as error:
+                raise InputError(
+                    "Input engine must be one whose package is installed, python -m pip install ray; "
+                    "instead received 'ray'."
+                ) from error
+            if not ray.is_initialized():
+                ray.init(num_cpus=workers, include_dashboard=False)
+                stack.callback(ray.shutdown)
+            register_ray()
+            stack.enter_context(joblib.parallel_config(backend="ray", n_jobs=workers))
+        yield
+
+
+def _kept(path: Path) -> list[Row] | None:
+    """Return the rows of a finished task, or None where there are none that can be read."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    fits = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    return rows if fits else None
+
+
+def run(tasks: Sequence[Task], folder: Path, *, engine: Engine = "local", workers: int = 2) -> dict[str, list[Row]]:
+    """Compute all tasks that ``folder`` does not hold yet; return the rows of each table, in the order of the tasks.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        What to compute.
+    folder : Path
+        Where each task's rows are kept as JSON, under a name made of its arguments and the program's sources.
+    engine : {"local", "dask", "ray"}
+        Processes of this machine, or a cluster.
+    workers : int
+        Processes, where the cluster does not know better.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{task.key()}.json" for task in tasks]
+    done = [_kept(path) for path in paths]
+    missing = [i for i, rows in enumerate(done) if rows is None]
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+    )
+    with bar:
+        shown = bar.add_task("points", total=len(tasks), completed=len(tasks) - len(missing))
+        if missing:
+            with _backend(engine, workers):
+                for first in range(0, len(missing), _A_ROUND * workers):
+                    some = missing[first : first + _A_ROUND * workers]
+                    for i, rows in zip(
+                        some, joblib.Parallel()(joblib.delayed(compute)(tasks[i]) for i in some), strict=True
+                    ):
+                        write_file(paths[i], json.dumps(rows).encode())
+                        done[i] = rows
+                    bar.update(shown, advance=len(some))
+    tables: dict[str, list[Row]] = {}
+    for task, rows in zip(tasks, done, strict=True):
+        tables.setdefault(task.table, []).extend(rows or [])
+    return tables

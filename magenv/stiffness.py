@@ -1,0 +1,107 @@
+"""How the magnetic wrench in the plane changes as the robots move while the EPMs stand still: 6 x 6, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magenv.dipole import dipole_field, dipole_force, dipole_force_gradient, dipole_gradient
+from magenv.kernels import kernel, law
+from magenv.params import require
+from magenv.poses import POSE_SIZE, to_cartesian
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+@law
+def _add_source(out: Floats, robot: int, n: Vector, s: Vector, r: Vector) -> None:
+    """Add what the source s at the offset r makes of moves of ``robot``, moment n, to its block of ``out`` (6, 6)."""
+    nx, ny, _ = n
+    a = 3 * robot
+    hxx, hxy, _, hyy, _, _ = dipole_force_gradient(*s, *n, *r)
+    gxx, gxy, _, gyy, _, _ = dipole_gradient(*s, *r)
+    bx, by, _ = dipole_field(*s, *r)
+    fx, fy, _ = dipole_force(*s, -ny, nx, 0.0, *r)  # F = G n, and n turns as z cross n
+    out[a, a] += hxx
+    out[a, a + 1] += hxy
+    out[a, a + 2] += fx
+    out[a + 1, a] += hxy
+    out[a + 1, a + 1] += hyy
+    out[a + 1, a + 2] += fy
+    out[a + 2, a] += nx * gxy - ny * gxx  # tau_z = n_x B_y - n_y B_x
+    out[a + 2, a + 1] += nx * gyy - ny * gxy
+    out[a + 2, a + 2] += -ny * by - nx * bx
+
+
+@law
+def _add_mutual(out: Floats, robot: int, n: Vector, s: Vector, r: Vector) -> None:
+    """Add what moves of the other robot, with moment s, make of the wrench on ``robot`` with moment n."""
+    nx, ny, _ = n
+    a, b = 3 * robot, 3 * (1 - robot)
+    hxx, hxy, _, hyy, _, _ = dipole_force_gradient(*s, *n, *r)
+    gxx, gxy, _, gyy, _, _ = dipole_gradient(*s, *r)
+    turned = (-s[1], s[0], 0.0)
+    fx, fy, _ = dipole_force(*turned, *n, *r)
+    bx, by, _ = dipole_field(*turned, *r)
+    out[a, b] -= hxx
+    out[a, b + 1] -= hxy
+    out[a, b + 2] += fx
+    out[a + 1, b] -= hxy
+    out[a + 1, b + 1] -= hyy
+    out[a + 1, b + 2] += fy
+    out[a + 2, b] -= nx * gxy - ny * gxx
+    out[a + 2, b + 1] -= nx * gyy - ny * gxy
+    out[a + 2, b + 2] += nx * by - ny * bx
+
+
+@kernel
+def stiffness_kernel(positions: Floats, moments: Floats, epms: Floats, epm_moment: float, out: Floats) -> None:
+    """Write the derivatives of (F_x, F_y, tau_z) of both robots by (x, y, heading) of both into ``out`` (6, 6).
+
+    ``epms`` (N, 6) holds centres and unit moments. Global frame, N and N m per m and rad.
+    """
+    out[:] = 0.0
+    for robot in range(2):
+        p, m = positions[robot], moments[robot]
+        q, other = positions[1 - robot], moments[1 - robot]
+        n, s = (m[0], m[1], m[2]), (other[0], other[1], other[2])
+        r = (p[0] - q[0], p[1] - q[1], p[2] - q[2])
+        _add_source(out, robot, n, s, r)
+        _add_mutual(out, robot, n, s, r)
+        for k in range(len(epms)):
+            e = epms[k]
+            s = (epm_moment * e[3], epm_moment * e[4], epm_moment * e[5])
+            _add_source(out, robot, n, s, (p[0] - e[0], p[1] - e[1], p[2] - e[2]))
+
+
+def planar_stiffness(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, epm_moment_am2: float) -> Floats:
+    """Return K = d(F_x, F_y, tau_z of both robots) / d(x, y, heading of both), global frame.
+
+    Parameters
+    ----------
+    positions, moments : array_like, shape (2, 3)
+        Robots' positions in m and moments in A m^2, in the plane.
+    pose : array_like, shape (5 N,)
+        EPM poses (see ``magenv.poses``).
+    epm_moment_am2 : float
+        Moment of each EPM in A m^2.
+
+    Returns
+    -------
+    ndarray, shape (6, 6)
+        N and N m per m and rad.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit or a moment is out of the plane.
+    """
+    p, m, x = (np.asarray(value, dtype=np.float64) for value in (positions, moments, pose))
+    for name, value in (("positions", p), ("moments", m)):
+        require(value.shape == (2, 3), name, "an array of shape (2, 3)", value.shape)
+    require(bool((m[:, 2] == 0.0).all()), "moments", "in the plane", m.tolist())
+    require(x.ndim == 1 and len(x) > 0 and len(x) % POSE_SIZE == 0, "pose", "an array of shape (5 N,)", x.shape)
+    out = np.empty((6, 6))
+    stiffness_kernel(p, m, np.concatenate(to_cartesian(x), axis=-1), float(epm_moment_am2), out)
+    return out
