@@ -25,7 +25,7 @@ _SLACK, _GAP_SLACK = 1e-4, 1e-6
 """Shares by which a found crosstalk may be above its limit, and a gap below, and still count."""
 
 
-_OPTIONS: Any = {"maxiter": 200, "ftol": 1e-9}
+_OPTIONS: Any = {"maxiter": 80, "ftol": 1e-6}
 
 
 class Authority(NamedTuple):
