@@ -270,8 +270,7 @@ def test_growth_is_that_of_the_plant() -> None:
     assert np.polyfit(0.05 * np.arange(len(late)), late, 1)[0] == pytest.approx(rate.real, rel=0.03)
 
 
-def test_no_hold_is_stable_and_drag_slows_its_fall() -> None:
-    """Earnshaw: some direction is always unstable."""
+def test_near_robots_are_held_unstably_and_drag_slows_their_fall() -> None:
     pair = Pair(0.03, 0.0, 90.0)
     found = hold(pair, TWO)
     assert found is not None
@@ -281,6 +280,20 @@ def test_no_hold_is_stable_and_drag_slows_its_fall() -> None:
     assert slowest_control_hz(-1.0) == 0.0
     with pytest.raises(ValueError, match="growth must be a number above 1"):
         slowest_control_hz(1.0, growth=1.0)
+
+
+def test_far_apart_some_hold_is_stable_in_the_plane_though_none_is_in_space() -> None:
+    """Earnshaw: the force's divergence is zero, so that what is stable in the plane is not across it."""
+    pair, rates = Pair(0.08, 0.0, 90.0), []
+    for seed in range(60):
+        found = hold(pair, TWO, components=IN_PLANE, seed=seed)
+        assert found is not None
+        rates.append(growth_rates(pair, TWO, found.pose, BODY)[0].real)
+        stiffness = planar_stiffness(pair.positions, pair.moments(TWO), found.pose, TWO.epm_moment_am2)
+        if rates[-1] < 0.0:
+            assert np.trace(stiffness[:2, :2]) < 0.0
+            assert np.trace(stiffness[3:5, 3:5]) < 0.0
+    assert min(rates) < 0.0 < max(rates)
 
 
 def test_far_cylinders_are_dipoles_and_near_ones_are_not() -> None:

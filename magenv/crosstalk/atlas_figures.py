@@ -13,7 +13,6 @@ from magenv.crosstalk.tasks import FARTHEST_M
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
-_TEN = np.log(10.0)
 
 
 def frontier(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
@@ -40,11 +39,12 @@ def frontier(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
                 axes.plot(1e3 * at, 1e3 * np.array(most), label=f"{angle:g} degrees", ms=4, **style)
             if n == 0:
                 axes.set_title(("$\\tau_y$", "$\\tau_z$", "$F_x$", "$F_y$", "$F_z$")[kind], fontsize=10)
-            axes.set_ylim(bottom=0.0)
             axes.grid(alpha=0.3)
             axes.set_ylabel(f"{numbers[n]} EPMs: " * (kind == 0) + ("mN m" if torque else "mN"))
             if n == len(numbers) - 1:
                 axes.set_xlabel("distance (mm)")
+        for axes in grid[0]:  # shared by its column
+            axes.set_ylim(bottom=0.0)
         grid[0, 0].legend(fontsize=8)
         yield f"frontier-{arrangement}", png(figure)
 
@@ -112,7 +112,8 @@ def stability(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
     figure = new_figure(
         max(5.0 * len(numbers), 7.0),
         7.6,
-        f"Fastest unstable motion at the most stable of {max(row['holds'] for row in rows)} holds found (plant paper)",
+        f"Growth of a small deviation in the plane, most stable of {max(row['holds'] for row in rows)} holds found "
+        "(plant paper)\nbelow 0 it decays; tenfold growth from command to command at a control rate of 0.43 times it",
     )
     grid = figure.subplots(2, len(numbers), squeeze=False, sharey=True, sharex=True)
     for line, in_plane, held in zip(grid, (False, True), ("all ten vanish", "six in the plane vanish"), strict=True):
@@ -122,11 +123,13 @@ def stability(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
                 some = sorted(some, key=lambda row: float(row["distance_m"]))
                 at = 1e3 * np.array([row["distance_m"] for row in some])
                 axes.plot(at, [row["growth_rate_per_s"] for row in some], label=told, ms=4, **style)
-            axes.set_yscale("log")
+            axes.set_yscale("symlog", linthresh=0.1)
+            ticks = (-0.1, 0, 0.1, 0.3, 1, 3, 10, 30)
+            axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.set_yticks([], minor=True)
+            axes.axhline(0.0, color="black", linewidth=0.8)
             axes.set_title(f"{n} EPMs, {held}", fontsize=10)
             finish(axes, "distance between the robots (mm)", "growth rate (1/s) = 1 / time constant")
-            right = axes.secondary_yaxis("right", functions=(lambda rate: rate / _TEN, lambda hz: hz * _TEN))
-            right.set_ylabel("control rate: tenfold growth a period (Hz)")
     yield "stability", png(figure)
 
 
@@ -170,6 +173,9 @@ def validity(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
         marks = {"color": style["color"], "marker": style["marker"]}
         right.plot(nearest, worst, linestyle="", label=f"r_min from the {source}", ms=4, **marks)
     right.set_yscale("log")
+    ticks = (1, 2, 5, 10, 20, 50)
+    right.set_yticks(ticks, [str(tick) for tick in ticks])
+    right.set_yticks([], minor=True)
     right.set_xlabel("nearest robot to an EPM's centre (mm)")
     right.set_ylabel("largest error of a component (% of its target)")
     right.grid(alpha=0.3)
@@ -199,5 +205,5 @@ def unlike(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
                 )
     finish(left, "angle of the second robot's magnet in its body (degrees)", "mean crosstalk (%)")
     finish(right, "moment of the second robot's magnet over the first's", "mean crosstalk (%)")
-    left.set_yscale("log")
+    left.set_ylim(bottom=0.0)
     yield "unlike", png(figure)

@@ -1,4 +1,7 @@
-"""Stability of a hold: how fast a small deviation grows while the EPMs stand still (Earnshaw: some direction does)."""
+"""Stability of a hold: how fast a small deviation in the plane grows while the EPMs stand still.
+
+Earnshaw's theorem forbids that all directions in space are stable, not that all in a plane are, whose normal is borne.
+"""
 
 from __future__ import annotations
 

@@ -104,10 +104,17 @@ def holdable_rows(n_epm: int, first_deg: float, second_deg: float, starts: int) 
     ]
 
 
+def _time_constant(rate: float) -> float:
+    return math.inf if rate <= 0.0 else 1.0 / rate
+
+
 def stability_rows(
     n_epm: int, distance_m: float, angle_deg: float, first_deg: float, in_plane: bool, holds: int
 ) -> list[Row]:
-    """Return how fast deviations grow in the most stable of ``holds`` holds found from as many seeds."""
+    """Return how fast deviations in the plane grow in the most stable of ``holds`` holds found from as many seeds.
+
+    The time constant is infinite where none grows.
+    """
     pair, system, body = Pair(distance_m, angle_deg, first_deg), System(n_epm=n_epm), PLANTS["paper"].body
     rates = []
     for seed in range(holds):
@@ -125,7 +132,7 @@ def stability_rows(
             "holds": len(rates),
             "growth_rate_per_s": slowest,
             "growth_rate_median_per_s": float(np.median(rates)) if rates else math.nan,
-            "time_constant_s": 1.0 / slowest,
+            "time_constant_s": _time_constant(slowest),
             "growth_in_half_a_second": math.exp(HALF_SECOND * slowest),
             "slowest_control_hz": slowest_control_hz(slowest) if rates else math.nan,
         }
