@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.crosstalk.plan import ARRANGEMENTS, LINE, SIDE, images
-from magenv.crosstalk.style import LINES, TITLES, Rows, finish, new_figure, png, setting, where
+from magenv.crosstalk.style import BOUNDS, LINES, TITLES, Rows, finish, new_figure, png, setting, where
 from magenv.crosstalk.tasks import FARTHEST_M
 from magenv.wrench import WRENCH_SIZE
 
@@ -24,7 +24,7 @@ def frontier(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
             14.0,
             2.9 * len(numbers) + 0.6,
             f"Most of each component, alone, at a crosstalk of at most {100 * limit:g} % (normalised), "
-            f"{TITLES[first]}\nless of both signs and of both robots; {starts}",
+            f"{TITLES[first]}\nless of both signs and of both robots; {starts}; {BOUNDS}",
         )
         grid = figure.subplots(len(numbers), 5, squeeze=False, sharex=True, sharey="col")
         for (n, kind), axes in zip(np.ndindex(len(numbers), 5), grid.ravel(), strict=True):
@@ -57,7 +57,7 @@ def holdable(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
         max(6.0 * len(numbers), 7.0),
         11.0,
         "Smallest distance at which both robots can be held still (mm)\n"
-        f"{least} starts at each distance; empty where no hold is found at {1e3 * FARTHEST_M:g} mm",
+        f"{least} starts at each distance; empty where no hold is found at {1e3 * FARTHEST_M:g} mm; {BOUNDS}",
     )
     grid = figure.subplots(2, len(numbers), squeeze=False)
     kinds = {"separation_m": "all ten components vanish", "separation_in_plane_m": "the six in the plane vanish"}
@@ -113,7 +113,8 @@ def stability(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
         max(5.0 * len(numbers), 7.0),
         7.6,
         f"Growth of a small deviation in the plane, most stable of {max(row['holds'] for row in rows)} holds found "
-        "(plant paper)\nbelow 0 it decays; tenfold growth from command to command at a control rate of 0.43 times it",
+        "(plant paper)\nbelow 0 it decays; tenfold growth from command to command at a control rate of 0.43 times it\n"
+        f"{BOUNDS}",
     )
     grid = figure.subplots(2, len(numbers), squeeze=False, sharey=True, sharex=True)
     for line, in_plane, held in zip(grid, (False, True), ("all ten vanish", "six in the plane vanish"), strict=True):

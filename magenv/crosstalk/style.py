@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magenv.allocation import FORCE_SCALE_N, TORQUE_SCALE_NM
 from magenv.crosstalk.plan import LINE, SIDE
 from magenv.crosstalk.tasks import Row
+from magenv.params import System
 
 Floats = NDArray[np.float64]
 Rows = Sequence[Row]
@@ -26,6 +27,12 @@ LINES: tuple[dict[str, Any], ...] = (
 )
 """Told apart by colour-blind eyes and in grey."""
 TITLES = {LINE: "first moment along the joining line", SIDE: "first moment at right angles to it"}
+_SYSTEM = System()
+BOUNDS = (
+    f"radii {_SYSTEM.r_min_m:g} to {_SYSTEM.r_max_m:g} m, "
+    f"EPMs attract each other with at most {_SYSTEM.attraction_max_n:g} N"
+)
+"""In words, for every figure."""
 _DPI = 130
 
 
@@ -47,9 +54,7 @@ def setting(rows: Rows, starts: str) -> str:
     """Return in words what the targets were."""
     amplitude = rows[0]["amplitude"]
     force, torque = 1e3 * amplitude * FORCE_SCALE_N, 1e3 * amplitude * TORQUE_SCALE_NM
-    return (
-        f"amplitude {amplitude:g} of the paper's targets: {force:g} mN, {torque:g} mN m; {starts}; radii 0.15 to 0.5 m"
-    )
+    return f"amplitude {amplitude:g} of the paper's targets: {force:g} mN, {torque:g} mN m; {starts}\n{BOUNDS}"
 
 
 def where(rows: Rows, **values: object) -> list[Row]:
