@@ -8,7 +8,7 @@ starts; the best is kept (``magenv.solver``).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -88,10 +88,15 @@ def _weights(force_scale_n: float, torque_scale_nm: float, components: Sequence[
     weights: Floats = 1.0 / component_scales(float(force_scale_n), float(torque_scale_nm))
     if components is None:
         return weights
-    chosen = list(components)
+    return np.where(np.isin(np.arange(WRENCH_SIZE), checked_components(components)), weights, 0.0)
+
+
+def checked_components(components: Sequence[int]) -> list[int]:
+    """Return indices into U as a list, or raise ``ValueError``."""
+    chosen = list(components) if isinstance(components, Iterable) else []
     fits = len(chosen) > 0 and all(is_whole(i) and 0 <= i < WRENCH_SIZE for i in chosen)
     require(fits, "components", f"indices from 0 to {WRENCH_SIZE - 1}, one at least", components)
-    return np.where(np.isin(np.arange(WRENCH_SIZE), chosen), weights, 0.0)
+    return chosen
 
 
 def _limits(system: System) -> Floats:

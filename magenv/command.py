@@ -24,7 +24,9 @@ INTERRUPTED = 130
 
 def command_line() -> str:
     """Return the command that started this process."""
-    return shlex.join(["python", Path(sys.argv[0]).name, *sys.argv[1:]])
+    spec = sys.modules["__main__"].__spec__
+    what = [Path(sys.argv[0]).name] if spec is None else ["-m", spec.name.removesuffix(".__main__")]
+    return shlex.join(["python", *what, *sys.argv[1:]])
 
 
 def parse(kind: type[Config], default: Config | None = None) -> Config:

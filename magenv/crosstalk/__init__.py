@@ -7,7 +7,7 @@ magenv.crosstalk`` sweeps them all and draws the figures.
 from magenv.crosstalk.activation import COMPONENTS, Activations, Pair, activate, crosstalk
 from magenv.crosstalk.frontier import Authority, authority
 from magenv.crosstalk.holdable import IN_PLANE, hold, holdable_separation
-from magenv.crosstalk.stability import growth_rates, slowest_control_hz
+from magenv.crosstalk.stability import growth_rates, most_stable_hold, slowest_control_hz
 from magenv.crosstalk.validity import exact_wrench
 
 __all__ = [
@@ -23,5 +23,6 @@ __all__ = [
     "growth_rates",
     "hold",
     "holdable_separation",
+    "most_stable_hold",
     "slowest_control_hz",
 ]

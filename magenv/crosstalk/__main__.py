@@ -26,7 +26,7 @@ class Options:
     """Analyse how independently two robots can be actuated: crosstalk.csv, other tables and figures in a folder."""
 
     n_epm: tuple[int, ...] = (2, 3)
-    """Numbers of external permanent magnets."""
+    """Numbers of external permanent magnets; the frontier is drawn for four as well."""
     amplitude: float = 0.2
     """Amplitude of the targets, as a share of the paper's 0.5 N and 0.05 N m."""
     starts: int = 10
@@ -63,10 +63,13 @@ def as_csv(rows: Sequence[Row]) -> bytes:
 def main() -> None:
     """Compute what is wanted and not yet there; write tables and figures."""
     options = parse(Options)
-    check_output_dir(options.out)
     tasks: list[Task] = []
     for part in dict.fromkeys(options.parts):
         tasks += PARTS[part](sorted(set(options.n_epm)), options.amplitude, options.starts)
+    require(
+        len(tasks) > 0, "parts", f"such that there is something to compute for n_epm {options.n_epm}", options.parts
+    )
+    check_output_dir(options.out)
     tables = run(tasks, options.out / "points", engine=options.engine, workers=options.workers)
     for table, rows in tables.items():
         write_file(options.out / f"{table}.csv", as_csv(rows))

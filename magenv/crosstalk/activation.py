@@ -10,7 +10,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magenv.allocation import allocate_batch, component_scales
+from magenv.allocation import allocate_batch, checked_components, component_scales
 from magenv.params import System, require
 from magenv.wrench import WRENCH_SIZE, planar_moments
 
@@ -42,7 +42,8 @@ class Pair:
             require(is_positive(getattr(self, name)), name, "a positive, finite number", getattr(self, name))
         for name in ("angle_deg", "first_deg"):
             value = getattr(self, name)
-            require(isinstance(value, (int, float)) and math.isfinite(value), name, "a finite number", value)
+            fits = not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
+            require(fits, name, "a finite number", value)
 
     @property
     def positions(self) -> Floats:
@@ -106,9 +107,7 @@ def activate(
         If the amplitude is not positive, or a component is none of U's.
     """
     require(is_positive(amplitude), "amplitude", "a positive, finite number", amplitude)
-    chosen = np.asarray(list(components), dtype=np.int64)
-    fits = len(chosen) > 0 and bool(((chosen >= 0) & (chosen < WRENCH_SIZE)).all())
-    require(fits, "components", f"indices from 0 to {WRENCH_SIZE - 1}, one at least", list(components))
+    chosen = np.array(checked_components(components), dtype=np.int64)
     target = amplitude * component_scales() * (np.arange(WRENCH_SIZE) == chosen[:, None])
     found = allocate_batch(target, pair.positions, pair.moments(system), system, starts=starts, seed=seed)
     return Activations(chosen, target, found.pose, found.wrench)
@@ -133,7 +132,10 @@ def crosstalk(wrench: ArrayLike, component: ArrayLike, scale: ArrayLike = 1.0) -
     """
     u = np.abs(np.asarray(wrench, dtype=np.float64) / np.asarray(scale, dtype=np.float64))
     require(u.shape[-1:] == (WRENCH_SIZE,), "wrench", f"an array of shape (..., {WRENCH_SIZE})", u.shape)
-    own = np.arange(WRENCH_SIZE) == np.asarray(component)[..., None]
+    i = np.asarray(component)
+    fits = bool(np.isin(i, np.arange(WRENCH_SIZE)).all())
+    require(fits, "component", f"indices from 0 to {WRENCH_SIZE - 1}", component)
+    own = np.arange(WRENCH_SIZE) == i[..., None]
     wanted, others = np.where(own, u, 0.0).sum(axis=-1), np.where(own, 0.0, u).max(axis=-1)
     ratio: Floats = np.divide(others, wanted, out=np.full(wanted.shape, np.inf), where=wanted > 0)
     return ratio

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from magenv.crosstalk.plan import ARRANGEMENTS, LINE, SIDE, images
 from magenv.crosstalk.style import BOUNDS, LINES, TITLES, Rows, finish, new_figure, png, setting, where
-from magenv.crosstalk.tasks import FARTHEST_M
+from magenv.crosstalk.tasks import CLEAR_STARTS, FARTHEST_M
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
@@ -57,7 +58,7 @@ def holdable(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
         max(6.0 * len(numbers), 7.0),
         11.0,
         "Smallest distance at which both robots can be held still (mm)\n"
-        f"{least} starts at each distance; empty where no hold is found at {1e3 * FARTHEST_M:g} mm; {BOUNDS}",
+        f"{least} starts at each distance; empty where none is found from {1e3 * FARTHEST_M:g} mm down; {BOUNDS}",
     )
     grid = figure.subplots(2, len(numbers), squeeze=False)
     kinds = {"separation_m": "all ten components vanish", "separation_in_plane_m": "the six in the plane vanish"}
@@ -112,7 +113,7 @@ def stability(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
     figure = new_figure(
         max(5.0 * len(numbers), 7.0),
         7.6,
-        f"Growth of a small deviation in the plane, most stable of {max(row['holds'] for row in rows)} holds found "
+        f"Growth of a small deviation in the plane, most stable of {max(row['holds'] for row in rows)} holds moved on "
         "(plant paper)\nbelow 0 it decays; tenfold growth from command to command at a control rate of 0.43 times it\n"
         f"{BOUNDS}",
     )
@@ -140,7 +141,8 @@ def validity(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
     figure = new_figure(
         11.0,
         4.8,
-        f"What remains with magnets that are cylinders\n{setting(rows, starts)}, first moment along the joining line",
+        f"What remains with magnets that are cylinders, first moment along the joining line\n{setting(rows, starts)}\n"
+        f"r_min from the robots: at most {CLEAR_STARTS} starts, radii from 0.01 m",
     )
     left, right = figure.subplots(1, 2)
     labels = [f"{n} EPMs\n{angle:g} deg\n{1e3 * d:g} mm" for n, angle, d in cases]
@@ -188,12 +190,16 @@ def unlike(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
     """Draw crosstalk of unlike robots."""
     numbers = sorted({row["n_epm"] for row in rows})
     distance = 1e3 * rows[0]["distance_m"]
-    figure = new_figure(9.6, 4.4, f"Unlike robots, parallel, {distance:g} mm apart\n{setting(rows, starts)}")
+    figure = new_figure(
+        9.6,
+        4.4,
+        f"Unlike robots, bodies parallel, {distance:g} mm apart, both asked for the same\n{setting(rows, starts)}",
+    )
     left, right = figure.subplots(1, 2, sharey=True)
-    styles = iter(LINES)
+    styles = itertools.cycle(LINES)
     for n in numbers:
         for first in ARRANGEMENTS:
-            style = next(styles, LINES[0])
+            style = next(styles)
             told = f"{n} EPMs, {'in line' if first == LINE else 'side by side'}"
             some = where(rows, n_epm=n, first_deg=first)
             for axes, by, fixed in (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magenv.allocation import allocate_batch, component_scales
 from magenv.crosstalk.activation import Pair, is_positive
 from magenv.margins import gap_margins
-from magenv.params import System, require
+from magenv.params import System, is_whole, require
 from magenv.poses import POSE_SIZE
 from magenv.wrench import WRENCH_SIZE, robot_wrench, wrench_jacobian
 
@@ -134,7 +134,8 @@ def authority(
     ValueError
         If a value is out of range.
     """
-    require(component in range(WRENCH_SIZE), "component", f"an index from 0 to {WRENCH_SIZE - 1}", component)
+    fits = is_whole(component) and 0 <= component < WRENCH_SIZE
+    require(fits, "component", f"an index from 0 to {WRENCH_SIZE - 1}", component)
     require(sign in (1.0, -1.0), "sign", "1 or -1", sign)
     require(is_positive(limit), "limit", "a positive, finite number", limit)
     targets = sign * np.outer(_LADDER, component_scales() * (np.arange(WRENCH_SIZE) == component))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magenv.allocation import Solution, allocate, component_scales
 from magenv.crosstalk.activation import Pair, is_positive
 from magenv.params import System, require
+from magenv.solver import NORM_FLOOR
 from magenv.wrench import WRENCH_SIZE, robot_frames
 
 Floats = NDArray[np.float64]
@@ -20,10 +21,9 @@ IN_PLANE = (1, 2, 3, 6, 7, 8)
 """Indices into U of what moves robots in their plane: tau_z, F_x, F_y of each. The rest is borne by the plane."""
 HELD = 1e-6
 """Share of the robots' mutual wrench that may be left over in a hold."""
-_NO_TARGET = 1e-6
-"""Norm by which ``allocate`` divides residuals where the target is zero."""
-_STEP = 0.94
-"""Factor from one distance to the next on the way down: one half in eleven steps."""
+_FINEST_M = 1e-9
+_STEP = 0.92
+"""Factor from one distance to the next on the way down: one half in eight steps."""
 
 
 def _mutual_wrench(pair: Pair, system: System) -> float:
@@ -57,7 +57,7 @@ def hold(
     initial : ndarray, shape (5 N,), optional
         Poses to begin with.
     """
-    tolerance = HELD * _mutual_wrench(pair, system) / _NO_TARGET
+    tolerance = HELD * _mutual_wrench(pair, system) / NORM_FLOOR  # the norm of a target of zero
     found = allocate(
         np.zeros(WRENCH_SIZE),
         pair.positions,
@@ -83,7 +83,7 @@ def holdable_separation(
     starts: int = 50,
     seed: int = 0,
 ) -> float:
-    """Return the smallest distance (m) at which the pair can be held, going nearer from its own distance.
+    """Return the smallest distance (m) at which the pair can be held, from its own distance down.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def holdable_separation(
     Returns
     -------
     float
-        NaN where the pair cannot be held even at its own distance; ``nearest_m`` where it can be all the way.
+        NaN where the pair can be held at no distance that was tried.
 
     Raises
     ------
@@ -112,25 +112,28 @@ def holdable_separation(
     """
     fits = is_positive(nearest_m) and nearest_m < pair.distance_m
     require(fits, "nearest_m", f"positive and less than the distance {pair.distance_m}", nearest_m)
-    require(is_positive(precision_m), "precision_m", "a positive, finite number", precision_m)
-    found = hold(pair, system, components=components, starts=starts, seed=seed)
-    if found is None:
-        return math.nan
-    held, lost = pair.distance_m, None
-    while lost is None or held - lost > precision_m:
-        trial = max(_STEP * held, nearest_m) if lost is None else 0.5 * (held + lost)
-        nearer = hold(
-            replace(pair, distance_m=trial),
-            system,
-            components=components,
-            starts=starts,
-            seed=seed,
-            initial=found.pose,
-        )
-        if nearer is None:
-            lost = trial
-            continue
-        held, found = trial, nearer
-        if held == nearest_m:
+    fits = is_positive(precision_m) and precision_m >= _FINEST_M
+    require(fits, "precision_m", f"a number of at least {_FINEST_M:g}", precision_m)
+    held, lost, distance, found = math.nan, math.nan, pair.distance_m, None
+    while True:  # the whole way down: some pairs can be held near each other and not farther apart
+        near = replace(pair, distance_m=distance)
+        initial = None if found is None else found.pose
+        nearer = hold(near, system, components=components, starts=starts, seed=seed, initial=initial)
+        if nearer is not None:
+            held, found, lost = distance, nearer, math.nan
+        elif math.isnan(lost):
+            lost = distance
+        if distance == nearest_m:
             break
+        distance = max(_STEP * distance, nearest_m)
+    if found is None or math.isnan(lost):
+        return held
+    while held - lost > precision_m:
+        distance = 0.5 * (held + lost)
+        near = replace(pair, distance_m=distance)
+        nearer = hold(near, system, components=components, starts=starts, seed=seed, initial=found.pose)
+        if nearer is None:
+            lost = distance
+        else:
+            held, found = distance, nearer
     return held

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -113,7 +114,7 @@ def sweeps(rows: Rows, starts: str) -> Iterator[tuple[str, bytes]]:
         )
         grid = figure.subplots(1, 2, squeeze=False, sharey=True)
         for first, axes in zip(ARRANGEMENTS, grid.ravel(), strict=True):
-            for n, style in zip(numbers, LINES, strict=False):
+            for n, style in zip(numbers, itertools.cycle(LINES), strict=False):
                 some = where(rows, n_epm=n, first_deg=first, angle_deg=0.0)
                 at, mean = _mean_over([row for row in some if row["panel"].startswith("distance")], "distance_m")
                 axes.plot(1e3 * at, mean, label=f"{n} EPMs", ms=4, **style)

@@ -29,10 +29,10 @@ FRONTIER_LIMIT = 0.05
 FRONTIER_MORE_EPMS = 4
 MAP_STEP_DEG = 15
 HOLDABLE_STARTS = 50
-"""At least: that nothing holds is known only from many."""
+"""That nothing holds is known only from many."""
 STABILITY_DISTANCES_M = (0.02, 0.0225, 0.025, 0.0275, 0.03, 0.035, 0.04, 0.05, 0.06, 0.08, 0.1)
 STABILITY_PAIRS = ((SIDE, 0.0), (SIDE, 180.0), (LINE, 0.0))
-STABILITY_HOLDS = 40
+STABILITY_HOLDS = 100
 MOUNTINGS_DEG = tuple(15.0 * k for k in range(7))
 RATIOS = (1.0, 0.75, 0.5, 0.25, 0.1)
 
@@ -94,7 +94,7 @@ def holdable(n_epm: Sequence[int], amplitude: float, starts: int) -> Iterator[Ta
     for n in n_epm:
         for first, second in map_corner():
             arguments = {"n_epm": n, "first_deg": float(first), "second_deg": float(second)}
-            yield Task("holdable", arguments | {"starts": max(starts, HOLDABLE_STARTS)})
+            yield Task("holdable", arguments | {"starts": HOLDABLE_STARTS})
 
 
 def map_corner() -> Iterator[tuple[int, int]]:

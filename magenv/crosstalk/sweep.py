@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from magenv.crosstalk.tasks import TASKS, Row
-from magenv.files import write_file
+from magenv.files import check_output_dir, write_file
 from magenv.params import InputError
 
 Engine = Literal["local", "dask", "ray"]
@@ -57,8 +57,11 @@ def compute(task: Task) -> list[Row]:
 
 
 @contextlib.contextmanager
-def _backend(engine: Engine, workers: int) -> Iterator[None]:
-    """Let joblib use the processes of this machine, or a cluster: Dask's of ``DASK_SCHEDULER_ADDRESS``, Ray's own."""
+def _backend(engine: Engine, workers: int) -> Iterator[int]:
+    """Let joblib use the processes of this machine, or a cluster; yield how many workers there are.
+
+    Dask's cluster is that of ``DASK_SCHEDULER_ADDRESS``, Ray's that of ``RAY_ADDRESS``; without, one of this machine.
+    """
     with contextlib.ExitStack() as stack:
         if engine == "local":
             stack.enter_context(joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1))
@@ -75,7 +78,7 @@ def _backend(engine: Engine, workers: int) -> Iterator[None]:
                 address = stack.enter_context(
                     LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
                 )
-            stack.enter_context(Client(address))
+            workers = sum(stack.enter_context(Client(address)).ncores().values())
             stack.enter_context(joblib.parallel_config(backend="dask"))
         else:
             try:
@@ -87,21 +90,31 @@ def _backend(engine: Engine, workers: int) -> Iterator[None]:
                     "instead received 'ray'."
                 ) from error
             if not ray.is_initialized():
-                ray.init(num_cpus=workers, include_dashboard=False)
+                local = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}
+                ray.init(**local)
                 stack.callback(ray.shutdown)
+            workers = int(ray.cluster_resources()["CPU"])
             register_ray()
             stack.enter_context(joblib.parallel_config(backend="ray", n_jobs=workers))
-        yield
+        yield workers
+
+
+def _digest_of(rows: list[Row]) -> str:
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def _kept(path: Path) -> list[Row] | None:
-    """Return the rows of a finished task, or None where there are none that can be read."""
+    """Return the rows of a finished task, or None where there are none that are as they were written."""
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        point = json.loads(path.read_text(encoding="utf-8"))
+        rows: list[Row] = point["rows"]
+        return rows if point["sha256"] == _digest_of(rows) else None
+    except (OSError, ValueError, TypeError, KeyError):
         return None
-    fits = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
-    return rows if fits else None
+
+
+def _keep(path: Path, rows: list[Row]) -> None:
+    write_file(path, json.dumps({"sha256": _digest_of(rows), "rows": rows}).encode())
 
 
 def run(tasks: Sequence[Task], folder: Path, *, engine: Engine = "local", workers: int = 2) -> dict[str, list[Row]]:
@@ -118,7 +131,7 @@ def run(tasks: Sequence[Task], folder: Path, *, engine: Engine = "local", worker
     workers : int
         Processes, where the cluster does not know better.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    check_output_dir(folder)
     paths = [folder / f"{task.key()}.json" for task in tasks]
     done = [_kept(path) for path in paths]
     missing = [i for i, rows in enumerate(done) if rows is None]
@@ -134,13 +147,12 @@ def run(tasks: Sequence[Task], folder: Path, *, engine: Engine = "local", worker
     with bar:
         shown = bar.add_task("points", total=len(tasks), completed=len(tasks) - len(missing))
         if missing:
-            with _backend(engine, workers):
-                for first in range(0, len(missing), _A_ROUND * workers):
-                    some = missing[first : first + _A_ROUND * workers]
-                    for i, rows in zip(
-                        some, joblib.Parallel()(joblib.delayed(compute)(tasks[i]) for i in some), strict=True
-                    ):
-                        write_file(paths[i], json.dumps(rows).encode())
+            with _backend(engine, workers) as present:
+                for first in range(0, len(missing), _A_ROUND * present):
+                    some = missing[first : first + _A_ROUND * present]
+                    computed = joblib.Parallel()(joblib.delayed(compute)(tasks[i]) for i in some)
+                    for i, rows in zip(some, computed, strict=True):
+                        _keep(paths[i], rows)
                         done[i] = rows
                     bar.update(shown, advance=len(some))
     tables: dict[str, list[Row]] = {}

@@ -12,8 +12,8 @@ import numpy as np
 from magenv.allocation import component_scales
 from magenv.crosstalk.activation import Activations, Pair, activate, crosstalk
 from magenv.crosstalk.frontier import authority
-from magenv.crosstalk.holdable import IN_PLANE, hold, holdable_separation
-from magenv.crosstalk.stability import growth_rates, slowest_control_hz
+from magenv.crosstalk.holdable import IN_PLANE, holdable_separation
+from magenv.crosstalk.stability import most_stable_hold, slowest_control_hz
 from magenv.crosstalk.validity import clear_of_robots, exact_wrench
 from magenv.params import PLANTS, System
 from magenv.poses import to_cartesian
@@ -28,7 +28,7 @@ FARTHEST_M = 0.06
 """Where the search for the holdable separation begins."""
 
 
-def _rows(found: Activations, pair: Pair, common: Row) -> list[Row]:
+def _rows(found: Activations, common: Row) -> list[Row]:
     scale = component_scales()
     normalised = crosstalk(found.wrench, found.component, scale)
     raw = crosstalk(found.wrench, found.component)
@@ -59,7 +59,7 @@ def activation_rows(
         "first_deg": first_deg,
         "starts": starts,
     }
-    return _rows(activate(pair, system, amplitude, starts=starts), pair, common)
+    return _rows(activate(pair, system, amplitude, starts=starts), common)
 
 
 def frontier_rows(
@@ -111,17 +111,14 @@ def _time_constant(rate: float) -> float:
 def stability_rows(
     n_epm: int, distance_m: float, angle_deg: float, first_deg: float, in_plane: bool, holds: int
 ) -> list[Row]:
-    """Return how fast deviations in the plane grow in the most stable of ``holds`` holds found from as many seeds.
+    """Return how fast deviations in the plane grow in the most stable hold found, the best of ``holds`` moved on.
 
     The time constant is infinite where none grows.
     """
     pair, system, body = Pair(distance_m, angle_deg, first_deg), System(n_epm=n_epm), PLANTS["paper"].body
-    rates = []
-    for seed in range(holds):
-        found = hold(pair, system, components=IN_PLANE if in_plane else None, seed=seed)
-        if found is not None:
-            rates.append(float(growth_rates(pair, system, found.pose, body)[0].real))
-    slowest = min(rates) if rates else math.nan
+    found = most_stable_hold(pair, system, body, components=IN_PLANE if in_plane else None, holds=holds)
+    pose, rates = found if found is not None else (np.full(5 * n_epm, math.nan), [math.nan])
+    slowest = rates[-1]
     return [
         {
             "n_epm": n_epm,
@@ -129,13 +126,14 @@ def stability_rows(
             "angle_deg": angle_deg,
             "first_deg": first_deg,
             "in_plane": in_plane,
-            "holds": len(rates),
+            "holds": holds,
             "growth_rate_per_s": slowest,
-            "growth_rate_median_per_s": float(np.median(rates)) if rates else math.nan,
+            "growth_rate_median_per_s": float(np.median(rates[:-1] or rates)),
             "time_constant_s": _time_constant(slowest),
             "growth_in_half_a_second": math.exp(HALF_SECOND * slowest),
-            "slowest_control_hz": slowest_control_hz(slowest) if rates else math.nan,
+            "slowest_control_hz": slowest_control_hz(slowest),
         }
+        | {f"x_{j}": float(value) for j, value in enumerate(pose)}
     ]
 
 

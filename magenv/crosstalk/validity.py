@@ -15,7 +15,7 @@ from magenv.allocation import component_scales
 from magenv.allocation_input import draw_starts
 from magenv.crosstalk.activation import Activations, Pair
 from magenv.margins import clearances, gap_margins
-from magenv.params import Magnet, System
+from magenv.params import Magnet, System, require
 from magenv.poses import POSE_SIZE, project, to_cartesian
 from magenv.wrench import WRENCH_SIZE, robot_frames, robot_wrench, wrench_jacobian
 
@@ -83,9 +83,14 @@ def exact_wrench(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, syst
     ------
     ImportError
         If magpylib is not installed.
+    ValueError
+        If a shape does not fit or a number is not finite.
     """
-    p, m = np.asarray(positions, dtype=np.float64), np.asarray(moments, dtype=np.float64)
-    centres, directions = to_cartesian(pose)
+    p, m, x = (np.asarray(value, dtype=np.float64) for value in (positions, moments, pose))
+    for name, value, shape in (("positions", p, (2, 3)), ("moments", m, (2, 3)), ("pose", x, (5 * system.n_epm,))):
+        fits = value.shape == shape and bool(np.isfinite(value).all())
+        require(fits, name, f"a finite array of shape {shape}", value.shape)
+    centres, directions = to_cartesian(x)
     epm = epm_magnet(system)
     epms = [_cylinder(epm, c, system.epm_moment_am2 * u) for c, u in zip(centres, directions, strict=True)]
     steps = np.concatenate([np.zeros((1, 3)), _OFFSET_M * np.eye(3), -_OFFSET_M * np.eye(3)])
