@@ -57,6 +57,13 @@ def test_a_row_for_each_component_with_the_columns_that_were_promised() -> None:
         assert float(row["crosstalk_normalised"]) == pytest.approx(normalised)
 
 
+def test_rows_of_unequal_numbers_of_epms_stand_in_one_table() -> None:
+    table = list(
+        csv.DictReader(io.StringIO(as_csv([{"n": 2, "x_0": 0.5}, {"n": 3, "x_0": 0.1, "x_1": 1e-17}]).decode()))
+    )
+    assert table == [{"n": "2", "x_0": "0.5", "x_1": ""}, {"n": "3", "x_0": "0.1", "x_1": "1e-17"}]
+
+
 def test_the_papers_panels_are_planned() -> None:
     planned = [task.arguments for task in panels([2, 3], 0.2, 10)]
     for name, n_epm, distance, angle in PANELS:

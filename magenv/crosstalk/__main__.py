@@ -52,9 +52,9 @@ class Options:
 
 
 def as_csv(rows: Sequence[Row]) -> bytes:
-    """Return rows of one table as CSV, numbers to the last digit."""
+    """Return rows of one table as CSV, numbers to the last digit; empty where a row lacks a column of others."""
     told = io.StringIO()
-    writer = csv.DictWriter(told, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(told, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return told.getvalue().encode()
