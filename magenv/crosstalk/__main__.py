@@ -68,8 +68,8 @@ def main() -> None:
     tasks: list[Task] = []
     for part in dict.fromkeys(options.parts):
         if part == "validity" and importlib.util.find_spec("magpylib") is None:
-            told = 'python -m pip install -c constraints.txt -e ".[exact]"'
-            print(f"Left out: validity, which needs magpylib ({told}).", file=sys.stderr)
+            install = 'python -m pip install -c constraints.txt -e ".[exact]"'
+            print(f"Left out: validity, which needs magpylib ({install}).", file=sys.stderr)
             continue
         tasks += PARTS[part](sorted(set(options.n_epm)), options.amplitude, options.starts)
     require(
