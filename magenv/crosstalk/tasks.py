@@ -56,10 +56,9 @@ def activation_rows(
         "distance_m": distance_m,
         "angle_deg": angle_deg,
         "amplitude": amplitude,
-        "first_deg": first_deg,
-        "starts": starts,
     }
-    return _rows(activate(pair, system, amplitude, starts=starts), common)
+    rows = _rows(activate(pair, system, amplitude, starts=starts), common)
+    return [row | {"first_deg": first_deg, "starts": starts} for row in rows]
 
 
 def frontier_rows(
