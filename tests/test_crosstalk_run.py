@@ -94,7 +94,7 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.
         return [{"panel": task.arguments["panel"], "x": float(task.arguments["distance_m"])}]
 
     monkeypatch.setattr(sweep, "compute", compute)
-    monkeypatch.setattr(sweep.joblib, "Parallel", lambda: lambda calls: [f(*a, **k) for f, a, k in calls])
+    monkeypatch.setattr(sweep, "Parallel", lambda: lambda calls: [f(*a, **k) for f, a, k in calls])
     monkeypatch.setattr(sweep, "_A_ROUND", 2)
     wanted = tasks(9)
     with pytest.raises(KeyboardInterrupt):

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import joblib
+from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -64,7 +64,7 @@ def _backend(engine: Engine, workers: int) -> Iterator[int]:
     """
     with contextlib.ExitStack() as stack:
         if engine == "local":
-            stack.enter_context(joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1))
+            stack.enter_context(parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1))
         elif engine == "dask":
             try:
                 from distributed import Client, LocalCluster
@@ -79,7 +79,7 @@ def _backend(engine: Engine, workers: int) -> Iterator[int]:
                     LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
                 )
             workers = sum(stack.enter_context(Client(address)).ncores().values())
-            stack.enter_context(joblib.parallel_config(backend="dask"))
+            stack.enter_context(parallel_config(backend="dask"))
         else:
             try:
                 import ray
@@ -95,7 +95,7 @@ def _backend(engine: Engine, workers: int) -> Iterator[int]:
                 stack.callback(ray.shutdown)
             workers = int(ray.cluster_resources()["CPU"])
             register_ray()
-            stack.enter_context(joblib.parallel_config(backend="ray", n_jobs=workers))
+            stack.enter_context(parallel_config(backend="ray", n_jobs=workers))
         yield workers
 
 
@@ -150,7 +150,7 @@ def run(tasks: Sequence[Task], folder: Path, *, engine: Engine = "local", worker
             with _backend(engine, workers) as present:
                 for first in range(0, len(missing), _A_ROUND * present):
                     some = missing[first : first + _A_ROUND * present]
-                    computed = joblib.Parallel()(joblib.delayed(compute)(tasks[i]) for i in some)
+                    computed = Parallel()(delayed(compute)(tasks[i]) for i in some)
                     for i, rows in zip(some, computed, strict=True):
                         _keep(paths[i], rows)
                         done[i] = rows
