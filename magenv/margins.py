@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,3 +49,33 @@ def clearances(x: Floats, points: Floats, least: float) -> tuple[Floats, Floats]
     for k in range(n):
         slopes[k, :, POSE_SIZE * k : POSE_SIZE * k + 3] = (apart[k] / distance[k][:, None] / least) @ slopes_of[k].T
     return (distance / least - 1.0).ravel(), slopes.reshape(-1, len(x))
+
+
+def minimise_within(
+    cost: Callable[[Floats], float],
+    slopes: Callable[[Floats], Floats],
+    margins: Callable[[Floats], Floats],
+    margin_slopes: Callable[[Floats], Floats],
+    low: Floats,
+    high: Floats,
+    start: Floats,
+    options: Any,
+) -> tuple[Floats, float]:
+    """Minimise ``cost`` where no margin is negative, within bounds, by SciPy's SLSQP; return where, and the cost there.
+
+    Whether the margins hold there is for the caller to see.
+    """
+    from scipy.optimize import Bounds, NonlinearConstraint, minimize  # a quarter of a second that few need
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of steps that were clipped to the bounds
+        found = minimize(
+            cost,
+            start,
+            jac=slopes,
+            method="SLSQP",
+            bounds=Bounds(low, high),
+            constraints=NonlinearConstraint(margins, 0.0, np.inf, jac=margin_slopes),
+            options=options,
+        )
+    return found.x, float(found.fun)

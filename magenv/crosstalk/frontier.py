@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from magenv.allocation import allocate_batch, component_scales
 from magenv.crosstalk.activation import Pair, is_positive
-from magenv.margins import gap_margins
+from magenv.margins import gap_margins, minimise_within
 from magenv.params import System, is_whole, require
 from magenv.poses import POSE_SIZE
 from magenv.wrench import WRENCH_SIZE, robot_wrench, wrench_jacobian
@@ -43,12 +42,6 @@ def _climb(
     pair: Pair, system: System, component: int, sign: float, limit: float, pose: Floats
 ) -> tuple[float, Floats, Floats]:
     """Maximise sign U_i / scale from a pose under |U_j| / scale <= limit U_i / scale, bounds and gap."""
-    from scipy.optimize import (  # a quarter of a second that importing magenv need not take
-        Bounds,
-        NonlinearConstraint,
-        minimize,
-    )
-
     positions, moments, scale = pair.positions, pair.moments(system), component_scales()
     unit = np.tile([1.0, 1.0, _RADIUS_UNIT_M, 1.0, 1.0], system.n_epm)
     others = np.arange(WRENCH_SIZE) != component
@@ -79,19 +72,8 @@ def _climb(
 
     low, high = np.full(len(pose), -np.inf), np.full(len(pose), np.inf)
     low[2::POSE_SIZE], high[2::POSE_SIZE] = system.r_min_m / _RADIUS_UNIT_M, system.r_max_m / _RADIUS_UNIT_M
-    begin: Floats = pose / unit
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of steps that were clipped to the bounds
-        found = minimize(
-            fall,
-            begin,
-            jac=fall_slopes,
-            method="SLSQP",
-            bounds=Bounds(low, high),
-            constraints=NonlinearConstraint(margins, 0.0, np.inf, jac=margin_slopes),
-            options=_OPTIONS,
-        )
-    y = np.clip(found.x, low, high)
+    found, _ = minimise_within(fall, fall_slopes, margins, margin_slopes, low, high, pose / unit, _OPTIONS)
+    y = np.clip(found, low, high)
     u = scaled(y)
     kept = margins(y)
     crossing, gaps = kept[: 2 * int(others.sum())], kept[2 * int(others.sum()) :]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magenv.allocation import component_scales
 from magenv.allocation_input import draw_starts
 from magenv.crosstalk.activation import Activations, Pair
-from magenv.margins import clearances, gap_margins
+from magenv.margins import clearances, gap_margins, minimise_within
 from magenv.params import Magnet, System, require
 from magenv.poses import POSE_SIZE, project, to_cartesian
 from magenv.wrench import WRENCH_SIZE, robot_frames, robot_wrench, wrench_jacobian
@@ -108,8 +107,6 @@ def exact_wrench(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, syst
 
 def _solve_clear(pair: Pair, system: System, target: Floats, begun: Sequence[Floats]) -> Floats:
     """Return the poses that come nearest to a target (10) with r_min kept from each robot, from several beginnings."""
-    from scipy.optimize import Bounds, NonlinearConstraint, minimize  # a quarter of a second, wanted by none but this
-
     positions, moments, scale = pair.positions, pair.moments(system), component_scales()
     weights = 1.0 / scale / np.linalg.norm(target / scale)
     low, high = np.full(len(begun[0]), -np.inf), np.full(len(begun[0]), np.inf)
@@ -133,19 +130,9 @@ def _solve_clear(pair: Pair, system: System, target: Floats, begun: Sequence[Flo
 
     least, best = math.inf, np.full(len(begun[0]), np.nan)
     for start in begun:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of steps that were clipped to the bounds
-            found = minimize(
-                cost,
-                start,
-                jac=cost_slopes,
-                method="SLSQP",
-                bounds=Bounds(low, high),
-                constraints=NonlinearConstraint(margins, 0.0, np.inf, jac=margin_slopes),
-                options=_OPTIONS,
-            )
-        if found.fun < least and (margins(found.x) >= -_SLACK).all():
-            least, best = float(found.fun), found.x
+        found, reached = minimise_within(cost, cost_slopes, margins, margin_slopes, low, high, start, _OPTIONS)
+        if reached < least and (margins(found) >= -_SLACK).all():
+            least, best = reached, found
     return best
 
 
