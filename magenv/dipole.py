@@ -234,15 +234,19 @@ def _rows_kernel(to_field: bool, to_gradient: bool) -> Callable[..., None]:
     return kernel(rows)
 
 
+def require_vectors(**values: ArrayLike) -> dict[str, Floats]:
+    """Return named arrays of vectors as they are, or raise ``InputError`` where one is not of shape (..., 3)."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    for name, array in arrays.items():
+        require(array.ndim >= 1 and array.shape[-1] == 3, name, "an array of shape (..., 3)", array.shape)
+    return arrays
+
+
 def _compute(
     moment: ArrayLike, source: ArrayLike, point: ArrayLike, to_field: bool, to_gradient: bool
 ) -> tuple[Floats, Floats]:
     """Broadcast the inputs and return fields (..., 3) and gradients (..., 3, 3), empty where not asked for."""
-    arrays = []
-    for name, value in (("moment", moment), ("source", source), ("point", point)):
-        array = np.asarray(value, dtype=np.float64)
-        require(array.ndim >= 1 and array.shape[-1] == 3, name, "an array of shape (..., 3)", array.shape)
-        arrays.append(array)
+    arrays = list(require_vectors(moment=moment, source=source, point=point).values())
     shape = np.broadcast(*arrays).shape
     n = math.prod(shape) // 3
     for i, array in enumerate(arrays):

@@ -23,6 +23,7 @@ ORDER = [
     "angles",
     "workers",
     "dipole",
+    "cylinder",
     "poses",
     "margins",
     "wrench",
