@@ -1,4 +1,4 @@
-"""Small dense linear algebra of the solver: Gram matrix, Cholesky factor and solution, without any allocation."""
+"""Small dense linear algebra: Gram matrix, Cholesky factor and solution, products, without any allocation."""
 
 from __future__ import annotations
 
@@ -54,3 +54,24 @@ def gram(a: Floats, out: Floats) -> None:
             first = a[0, i] * a[0, j] + a[1, i] * a[1, j] + a[2, i] * a[2, j] + a[3, i] * a[3, j] + a[4, i] * a[4, j]
             second = a[5, i] * a[5, j] + a[6, i] * a[6, j] + a[7, i] * a[7, j] + a[8, i] * a[8, j] + a[9, i] * a[9, j]
             out[i, j] = first + second
+
+
+@kernel
+def add_product(a: Floats, b: Floats, out: Floats) -> None:
+    """Add a b to ``out`` (n, m), of ``a`` (n, k) and ``b`` (k, m)."""
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            by = a[i, k]
+            for j in range(b.shape[1]):
+                out[i, j] += by * b[k, j]
+
+
+@kernel
+def add_transposed_product(a: Floats, b: Floats, out: Floats) -> None:
+    """Add a^T b to ``out`` (n, m), of ``a`` (k, n) and ``b`` (k, m)."""
+    for k in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            by = a[k, i]
+            if by != 0.0:  # much of a Jacobian is empty
+                for j in range(b.shape[1]):
+                    out[i, j] += by * b[k, j]

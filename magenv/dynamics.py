@@ -20,16 +20,24 @@ from magenv.lanes import (
     DECAY1,
     DECAY2,
     EPMS,
+    FRICTION,
     GAIN1,
     GAIN2,
     HEADING1,
     HEADING2,
     MOMENT1,
     MOMENT2,
+    PUSH_TURN1,
+    PUSH_TURN2,
+    PUSH_X1,
+    PUSH_X2,
+    PUSH_Y1,
+    PUSH_Y2,
     RATE1,
     RATE2,
     TURN_DECAY1,
     TURN_DECAY2,
+    TURN_FRICTION,
     TURN_GAIN1,
     TURN_GAIN2,
     VX1,
@@ -49,6 +57,8 @@ Floats = NDArray[np.float64]
 TOUCH = 1
 WALL = 2
 _CONTACT_TURNS = 200
+_NO_SPEED = 1e-300
+"""Stands for zero where it is divided by."""
 _SLIGHTLY_MORE = 1.0 + 1e-9  # more than rounding can be
 
 
@@ -88,6 +98,7 @@ class Physics(NamedTuple):
         )
 
 
+Pair = tuple[float, float]
 PlanarSums = tuple[float, float, float, float, float]
 """What sources do to a robot in the plane: B_x, B_y (T), force per moment along it (T/m), F_x, F_y of the rest (N)."""
 
@@ -245,8 +256,23 @@ def _keep_inside(robots: Floats, limit: float) -> int:
 
 
 @law
-def advance(lanes: Floats, i: int, n_epm: int, h: float) -> None:
-    """Advance both robots of lane ``i`` by ``h`` (s), contact apart.
+def _rub(speed: float, gain: float, friction: float) -> float:
+    """Return by what dry friction (N, or N m) multiplies a speed at the end of a kick: it brings to rest, not farther.
+
+    Coulomb's law, implicit in the new speed, so that a robot at rest stays there while less than the friction acts.
+    """
+    return max(0.0, 1.0 - gain * friction / max(speed, _NO_SPEED))
+
+
+@law
+def _rub_both(lanes: Floats, i: int, gain: float, vx: float, vy: float) -> Pair:
+    left = _rub(math.sqrt(dot2(vx, vy, vx, vy)), gain, lanes[FRICTION, i])
+    return left * vx, left * vy
+
+
+@law
+def advance(lanes: Floats, i: int, n_epm: int, h: float, rough: bool) -> None:
+    """Advance both robots of lane ``i`` by ``h`` (s), contact apart; where ``rough``, pushed and rubbed as well.
 
     Half a drift, a kick with drag integrated exactly, half a drift: symmetric, so of second order, with one evaluation
     of the wrench; exact for the terminal velocity however strong the drag.
@@ -257,11 +283,19 @@ def advance(lanes: Floats, i: int, n_epm: int, h: float) -> None:
     x1, y1, heading1 = fma(half, vx1, lanes[X1, i]), fma(half, vy1, lanes[Y1, i]), fma(half, rate1, lanes[HEADING1, i])
     x2, y2, heading2 = fma(half, vx2, lanes[X2, i]), fma(half, vy2, lanes[Y2, i]), fma(half, rate2, lanes[HEADING2, i])
     f1x, f1y, tz1, f2x, f2y, tz2 = robots_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
+    if rough:
+        f1x, f1y, tz1 = f1x + lanes[PUSH_X1, i], f1y + lanes[PUSH_Y1, i], tz1 + lanes[PUSH_TURN1, i]
+        f2x, f2y, tz2 = f2x + lanes[PUSH_X2, i], f2y + lanes[PUSH_Y2, i], tz2 + lanes[PUSH_TURN2, i]
     # v = decay v + gain F
     vx1, vy1 = dot2(lanes[DECAY1, i], lanes[GAIN1, i], vx1, f1x), dot2(lanes[DECAY1, i], lanes[GAIN1, i], vy1, f1y)
     vx2, vy2 = dot2(lanes[DECAY2, i], lanes[GAIN2, i], vx2, f2x), dot2(lanes[DECAY2, i], lanes[GAIN2, i], vy2, f2y)
     rate1 = dot2(lanes[TURN_DECAY1, i], lanes[TURN_GAIN1, i], rate1, tz1)
     rate2 = dot2(lanes[TURN_DECAY2, i], lanes[TURN_GAIN2, i], rate2, tz2)
+    if rough:
+        vx1, vy1 = _rub_both(lanes, i, lanes[GAIN1, i], vx1, vy1)
+        vx2, vy2 = _rub_both(lanes, i, lanes[GAIN2, i], vx2, vy2)
+        rate1 *= _rub(abs(rate1), lanes[TURN_GAIN1, i], lanes[TURN_FRICTION, i])
+        rate2 *= _rub(abs(rate2), lanes[TURN_GAIN2, i], lanes[TURN_FRICTION, i])
     lanes[VX1, i], lanes[VY1, i], lanes[RATE1, i] = vx1, vy1, rate1
     lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i] = vx2, vy2, rate2
     lanes[X1, i], lanes[Y1, i], lanes[HEADING1, i] = fma(half, vx1, x1), fma(half, vy1, y1), fma(half, rate1, heading1)

@@ -211,7 +211,7 @@ def hold_rows(
         for i in range(width):
             if travels:
                 carry(lanes, i, n_epm)
-            advance(lanes, i, n_epm, h)
+            advance(lanes, i, n_epm, h, False)
             flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
             rare |= flagged[i]
         if rare:

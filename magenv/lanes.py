@@ -33,7 +33,10 @@ MEASURED = 52
 POSITION_ERROR, HEADING_ERROR, POSITION_END, HEADING_END, SEPARATION_MIN, SEPARATION_TRACKED = range(52, 58)
 MEASURED_SIZE = 6
 
-EPMS = 58
+# What else acts on a robot on a rough plant: a force and a torque that push it, and dry friction against both motions.
+PUSH_X1, PUSH_X2, PUSH_Y1, PUSH_Y2, PUSH_TURN1, PUSH_TURN2, FRICTION, TURN_FRICTION = range(58, 66)
+
+EPMS = 66
 """First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
 
 

@@ -161,6 +161,10 @@ class Plant:
     """Greatest speed of an EPM's centre, m/s; infinite together with the next, the EPMs jump (paper)."""
     epm_turn_radps: float = math.inf
     """Greatest angular speed of an EPM's moment, rad/s."""
+    dry_friction_n: float = 0.0
+    """Coulomb friction against a robot's translation, N."""
+    dry_friction_nm: float = 0.0
+    """Coulomb friction against its rotation, N m."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)

@@ -37,7 +37,7 @@ def run(robots: Floats, epms: Floats, plant: Plant, h: float, steps: int, system
     lane = one_lane(robots, epms, Physics.of(system, plant, 1), h)
     path = [robots.copy()]
     for _ in range(steps):
-        advance(lane, 0, len(epms), h)
+        advance(lane, 0, len(epms), h, False)
         assert not may_touch(lane, 0, plant.body.diameter_m, plant.workspace_radius_m)
         path.append(lane[:12, 0].reshape(6, 2).T.copy())
     return np.array(path)

@@ -1,0 +1,140 @@
+"""Plans for the predictive controller: from the last plan, and where that does not converge, from elsewhere.
+
+Elsewhere are poses that hold the robots on their way by statics; from them, plans are made for longer and longer parts
+of the command's time, in which errors grow less than in the whole of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.actions import planar_target
+from magenv.allocation import allocate
+from magenv.forecast import STATE, Goal, Motion
+from magenv.horizon import Scratch, land, plan
+from magenv.manoeuvre import Arms
+from magenv.params import Plant, System
+from magenv.poses import to_cartesian
+from magenv.sensitivity import COORDINATES, Model
+from magenv.wrench import WRENCH_SIZE, planar_moments
+
+Floats = NDArray[np.float64]
+
+ENOUGH = 1.0
+"""Cost per command below which a plan is taken without seeking others."""
+TROUBLE = 20.0
+"""Cost per command above which more are sought."""
+SEARCHES, MORE_SEARCHES = 16, 60
+LATER_SEARCHES = 3
+"""Starts of the later commands of a plan."""
+ITERATIONS, SHORT_ITERATIONS = 15, 8
+CONVERGED = 1e-3
+"""Cost at which a plan is as good as can be."""
+PARTS = (0.5,)
+"""Shares of a command's time for which a plan from elsewhere is made first."""
+PLANAR = (1, 2, 3, 6, 7, 8)
+"""Components of the wrench that the plane does not bear."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a plan is for."""
+
+    state: Floats
+    """(12,) from which the first command acts."""
+    pushing: Floats
+    """(6,) wrench that acts besides, N and N m."""
+    doubt: Floats
+    """(12, 12) root of the state's covariance."""
+    goal: Goal
+    before: Floats
+    """(N, 6) EPMs until then."""
+
+    def ahead(self) -> Floats:
+        """Return the way (6,) to the first pose of the goal, m and rad."""
+        way: Floats = self.goal.references[0, -1, :COORDINATES] - self.state[:COORDINATES]
+        way[2::3] = np.remainder(way[2::3] + math.pi, 2 * math.pi) - math.pi
+        return way
+
+
+class Planner:
+    """Plans of ``stages`` commands of ``substeps`` each on a nominal plant."""
+
+    def __init__(self, system: System, plant: Plant, period_s: float, substeps: int, stages: int) -> None:
+        self._system, self._plant, self._period_s, self._stages = system, plant, period_s, stages
+        self.model = Model.of(system, plant, period_s / substeps)
+        self._arms = Arms.of(system)
+        n = system.n_epm
+        self._motion = Motion.of(n, substeps, False)
+        self._parts = [Motion.of(n, max(1, round(share * substeps)), False) for share in PARTS]
+        self._scratch, self._single = Scratch.of(stages, n, 1), Scratch.of(1, n, 1)
+
+    def plan(self, problem: Problem, last: Floats, rng: np.random.Generator) -> tuple[Floats, float, bool]:
+        """Return the best commands (H, N, 6) found, their cost, and whether they were sought elsewhere.
+
+        ``last`` (H, N, 6) is where to begin. The cost is infinite where nothing was found.
+        """
+        best, sought = last.copy(), False
+        cost = self._polish(problem, best)
+        turn, enough = 0, ENOUGH * self._stages
+        while not cost < enough and turn < (SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES):
+            new, commands = self._from_statics(problem, cost, rng)
+            if new < cost:
+                best, cost, sought = commands, new, True
+            turn += 1
+        return best, cost, sought
+
+    def _polish(self, problem: Problem, commands: Floats) -> float:
+        """Improve commands (H, N, 6) in place; return their cost."""
+        return plan(
+            self.model, problem.state, problem.pushing, problem.doubt, problem.goal, self._arms, self._motion,
+            problem.before, CONVERGED, ITERATIONS, self._scratch, commands,
+        )[0]
+
+    def _from_statics(self, problem: Problem, least: float, rng: np.random.Generator) -> tuple[float, Floats]:
+        """Return cost and commands (H, N, 6) of a plan that is made of one command after another, then improved.
+
+        One whose first command costs more than ``least`` is given up.
+        """
+        cost, first = self._held_on_the_way(problem, rng)
+        if self._stages == 1 or not cost < least:
+            return cost if self._stages == 1 else math.inf, first
+        goal, commands, state, before = problem.goal, [first[0]], problem.state.copy(), problem.before
+        for stage in range(1, self._stages):
+            land(self.model, state, problem.pushing, goal, self._arms, self._motion, before, commands[-1])
+            before = commands[-1]
+            later = Problem(
+                state, problem.pushing, np.zeros((STATE, STATE)), goal._replace(references=goal.references[stage:]), before
+            )
+            found = [self._held_on_the_way(later, rng) for _ in range(LATER_SEARCHES)]
+            commands.append(min(found, key=lambda pair: pair[0])[1][0])
+        whole = np.stack(commands)
+        return self._polish(problem, whole), whole
+
+    def _held_on_the_way(self, problem: Problem, rng: np.random.Generator) -> tuple[float, Floats]:
+        """Return cost and command (1, N, 6) of a plan from poses that hold the robots on their way by statics."""
+        ahead, body = problem.ahead(), self._plant.body
+        halfway = problem.state[:COORDINATES] + 0.5 * ahead
+        drag = np.array([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad] * 2)
+        target, positions = np.empty(WRENCH_SIZE), np.zeros((2, 3))
+        planar_target(drag * ahead / self._period_s - problem.pushing, halfway[2], halfway[5], target)
+        positions[:, :2] = halfway.reshape(2, 3)[:, :2]
+        moments = planar_moments(halfway[2::3], self._system.ipm_moment_am2)
+        held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+        command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
+        none, cost = np.zeros((STATE, STATE)), math.inf
+        for motion in (*self._parts, self._motion):
+            whole = motion is self._motion
+            share = len(motion.which) / len(self._motion.which)
+            way = np.concatenate([problem.state[:COORDINATES] + share * ahead, ahead / self._period_s])
+            part = problem.goal._replace(marks=np.array([len(motion.which)]), references=way[None, None])
+            cost, _ = plan(
+                self.model, problem.state, problem.pushing, problem.doubt if whole else none,
+                problem.goal if whole else part, self._arms, motion, problem.before, CONVERGED,
+                ITERATIONS if whole else SHORT_ITERATIONS, self._single, command,
+            )
+        return cost, command

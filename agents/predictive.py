@@ -1,0 +1,182 @@
+"""The predictive controller: EPM poses straight from the motion that a model of the plant predicts.
+
+At every control instant a filter estimates the robots' state and what pushes them, and the plan over the coming
+commands (``planner``) is made anew from the last one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.planner import ENOUGH, Planner, Problem
+from magenv.actions import ActionMode, pose_to_action
+from magenv.forecast import STATE, Goal, Motion
+from magenv.observer import KNOWN, Noise, correct, forecast
+from magenv.params import PLANTS, Plant, System, TaskParams, choose
+from magenv.poses import from_cartesian
+from magenv.sensitivity import COORDINATES
+from magenv.task import Frame, Layout, ObservationMode, unpack
+
+Floats = NDArray[np.float64]
+
+HORIZON_S = 0.2
+"""Commands are planned for so long a time, one at least."""
+POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
+"""Errors that count one, and the time in which an error of the rate would make them: the robots' drag forgets faster."""
+# What finite numbers and the neglected curvature of the motion leave in doubt, however exact the plant is.
+_FLOOR_M, _FLOOR_RAD, _FLOOR_MPS, _FLOOR_RADPS = 3e-6, 3e-6, 1e-5, 3e-5
+_PUSH_N, _PUSH_NM = 3e-5, 3e-8
+
+CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
+"""How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
+the last safe command held."""
+
+
+@dataclass
+class Memory:
+    """What is remembered of one episode."""
+
+    known: Floats
+    """(18,) estimate of the state, and of what pushes."""
+    covariance: Floats
+    """(18, 18)"""
+    commands: Floats
+    """(H, N, 6) the plan from the present instant on."""
+
+
+@dataclass
+class PredictiveState:
+    """What is remembered of ``n`` episodes; and how the last commands were come by."""
+
+    rows: list[Memory | None]
+    status: NDArray[np.int64]
+    """(n,) codes: CONVERGED, SOUGHT, UNSOLVED, FALLBACK."""
+
+
+def _per_coordinate(position: float, heading: float) -> Floats:
+    return np.array([position, position, heading] * 2)
+
+
+class Predictive:
+    """Model predictive control behind ``predict``, on nominal parameters of its own.
+
+    Parameters
+    ----------
+    n_epm : int
+        Number of EPMs.
+    control_hz : float
+        Control rate.
+    plant : str
+        Of whose kind the nominal plant is: how EPMs move, how exact measurements are.
+    name : str
+        Under which results are reported.
+    """
+
+    action: ActionMode = "pose"
+    observation: ObservationMode = "full"
+    frame: Frame = "robots"
+
+    def __init__(
+        self, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper", name: str = "predictive"
+    ) -> None:
+        self.name = name
+        self._system, self._plant = System(n_epm=n_epm), choose(PLANTS, "plant", plant)
+        self._period_s = period = TaskParams(control_hz=control_hz).period_s
+        self._layout = Layout(self._system, self._plant.workspace_radius_m, period, self.observation, self.frame)
+        self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
+        self._stages = min(4, max(1, round(HORIZON_S / period)))
+        self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
+        self._held = Motion.of(n_epm, self._substeps, False)
+        self._weights = np.concatenate(
+            [_per_coordinate(1 / POSITION_M, 1 / HEADING_RAD), _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)]
+        )
+        self._weights[COORDINATES:] *= SETTLING_S
+        self._noise = _noise(self._plant)
+        self._floor = np.concatenate(
+            [_per_coordinate(0.3 * _FLOOR_M, _FLOOR_RAD), _per_coordinate(_FLOOR_MPS, _FLOOR_RADPS)]
+        )
+        self.seed(0)
+
+    def seed(self, seed: int) -> None:
+        """Fix the random starts to come."""
+        self._seeds = np.random.SeedSequence(seed)
+        self._rngs = [np.random.default_rng(self._seeds)]
+
+    def predict(
+        self,
+        observation: NDArray[np.float32],
+        state: PredictiveState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], PredictiveState]:
+        """Return the ``pose`` actions (n, 5 N) for observations (n, d), or (5 N,) for (d,), and the new state."""
+        batch = np.atleast_2d(observation)
+        parts = unpack(batch, self._layout)
+        n = len(batch)
+        if state is None:
+            state = PredictiveState([None] * n, np.zeros(n, np.int64))
+        missing = n - len(self._rngs)  # each row has random numbers of its own, whatever the others draw
+        self._rngs += [np.random.default_rng(child) for child in self._seeds.spawn(max(missing, 0))]
+        actions = np.empty((n, self._system.n_epm * 5), np.float32)
+        epms = np.concatenate([parts.epm_positions, parts.epm_directions], axis=-1)
+        for i in range(n):
+            memory = None if episode_start is not None and episode_start[i] else state.rows[i]
+            measured = parts.robots[i].reshape(-1)
+            memory = self._begin(measured, epms[i]) if memory is None else self._update(memory, measured, epms[i])
+            goal = self._goal(parts.reference[i].reshape(-1, COORDINATES))
+            state.status[i] = self._decide(memory, goal, epms[i], self._rngs[i])
+            state.rows[i] = memory
+            command = memory.commands[0]
+            actions[i] = pose_to_action(from_cartesian(command[:, :3], command[:, 3:]), self._system)
+            memory.commands = np.concatenate([memory.commands[1:], memory.commands[-1:]])
+        return actions.reshape(*np.shape(observation)[:-1], -1), state
+
+    def _begin(self, measured: Floats, epms: Floats) -> Memory:
+        """Return the memory of an episode that begins, at rest."""
+        known, covariance = np.zeros(KNOWN), np.zeros((KNOWN, KNOWN))
+        known[:COORDINATES] = measured
+        unknown = _per_coordinate(_START_MPS, _START_RADPS) ** 2
+        covariance[np.diag_indices(KNOWN)] = np.concatenate([self._noise.measured, unknown, self._noise.drift])
+        return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0))
+
+    def _update(self, memory: Memory, measured: Floats, epms: Floats) -> Memory:
+        """Carry the estimate over the last hold, of EPMs (N, 6), and correct it."""
+        self._held.path[0] = epms
+        forecast(self._planner.model, self._held, 0, self._substeps, self._noise, memory.known, memory.covariance)
+        correct(measured, self._noise, memory.known, memory.covariance)
+        return memory
+
+    def _goal(self, references: Floats) -> Goal:
+        """Return the goal at the ends of the commands' times, from the references (5, 6) told."""
+        turn = np.diff(references, axis=0)
+        turn[:, 2::3] = np.remainder(turn[:, 2::3] + math.pi, 2 * math.pi) - math.pi
+        rates = np.concatenate([1.5 * turn[:1] - 0.5 * turn[1:2], 0.5 * (turn[:-1] + turn[1:])]) / self._period_s
+        states = np.concatenate([references[:4], rates], axis=-1)
+        return Goal(np.array([self._substeps]), states[: self._stages, None], self._weights, 0.0)
+
+    def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
+        """Write the best plan found into the memory; return how it was come by."""
+        doubt = np.linalg.cholesky(memory.covariance[:STATE, :STATE] + np.diag(self._floor**2))
+        problem = Problem(memory.known[:STATE].copy(), memory.known[STATE:].copy(), doubt, goal, epms)
+        memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)
+        if not math.isfinite(cost):
+            memory.commands = np.repeat(epms[None], self._stages, axis=0)
+            return FALLBACK
+        return UNSOLVED if cost > ENOUGH * self._stages else SOUGHT if sought else CONVERGED
+
+
+_START_MPS, _START_RADPS = 1e-3, 1e-3
+"""Rates that an episode may begin with."""
+
+
+def _noise(plant: Plant) -> Noise:
+    """Return what the filter reckons with on a plant of this kind."""
+    return Noise(
+        _per_coordinate(_FLOOR_M, _FLOOR_RAD) ** 2,
+        _per_coordinate(_PUSH_N, _PUSH_NM) ** 2,
+        _per_coordinate(0.1 * _FLOOR_M, 0.1 * _FLOOR_RAD) ** 2,
+    )
