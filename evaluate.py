@@ -11,9 +11,12 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends t
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from agents.catalogue import controller, defaults, names
 from agents.comparison import compare
+from agents.ladder import Ladder
+from agents.ladder_run import run_ladder
 from magenv.command import command_line, friendly, parse
 
 
@@ -35,8 +38,12 @@ class EvaluateConfig:
     """Episodes per controller and scenario."""
     seed: int = 0
     """Of the first episode; the others follow."""
-    out: Path = Path("runs/evaluate")
-    """Folder of the report."""
+    ladder: Literal["none", "parallel", "anti"] = "none"
+    """Climb down the ladder of separations instead of the scenarios, with parallel or opposite headings."""
+    jobs: int = 1
+    """Processes that share the episodes of the ladder."""
+    out: Path | None = None
+    """Folder of the report, by default runs/evaluate; of a ladder runs/ladder, where one broken off goes on."""
     list: bool = False
     """Print the known controllers, one name a line, and stop."""
 
@@ -53,7 +60,12 @@ def main() -> None:
             print(f"left out: {reason}", file=sys.stderr)
     else:
         chosen = [controller(name, c.n_epm, c.control_hz) for name in c.controllers]
-    compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, c.out, command_line())
+    if c.ladder == "none":
+        out = c.out or Path("runs/evaluate")
+        compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, out, command_line())
+    else:
+        ladder = Ladder(c.plant, c.n_epm, c.control_hz, c.ladder == "anti", c.episodes, c.seed)
+        run_ladder(chosen, ladder, c.jobs, c.out or Path("runs/ladder"), command_line())
 
 
 if __name__ == "__main__":

@@ -40,17 +40,7 @@ def compare(
     ValueError
         If an argument is unsound or ``out`` cannot be written; nothing has run then.
     """
-    names = [controller.name for controller in controllers]
-    distinct = len({file_name(name) for name in names}) == len(names)
-    require(len(controllers) > 0 and distinct, "controllers", "one or more, each once, of distinct file names", names)
-    require(
-        len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios
-    )
-    for scenario in scenarios:
-        for c in controllers:
-            Episodes(1, Settings(scenario, plant, n_epm, c.action, c.observation, c.frame, control_hz))
-    require(episodes >= 1, "episodes", "at least 1", episodes)
-    require(0 <= seed <= SEED_MAX, "seed", f"a whole number from 0 to {SEED_MAX}", seed)
+    check(controllers, scenarios, plant, n_epm, control_hz, episodes, seed)
     check_output_dir(out)
     records: list[Record] = []
     interrupted: KeyboardInterrupt | None = None
@@ -66,6 +56,43 @@ def compare(
         raise interrupted
 
 
+def check(
+    controllers: Sequence[Controller],
+    scenarios: Sequence[str],
+    plant: str,
+    n_epm: int,
+    control_hz: float,
+    episodes: int,
+    seed: int,
+) -> None:
+    """Raise ``ValueError`` unless these controllers can be compared so."""
+    names = [controller.name for controller in controllers]
+    distinct = len({file_name(name) for name in names}) == len(names)
+    require(len(controllers) > 0 and distinct, "controllers", "one or more, each once, of distinct file names", names)
+    require(
+        len(scenarios) > 0 and len(set(scenarios)) == len(scenarios), "scenarios", "one or more, each once", scenarios
+    )
+    for scenario in scenarios:
+        for c in controllers:
+            Episodes(1, Settings(scenario, plant, n_epm, c.action, c.observation, c.frame, control_hz))
+    require(episodes >= 1, "episodes", "at least 1", episodes)
+    require(0 <= seed <= SEED_MAX, "seed", f"a whole number from 0 to {SEED_MAX}", seed)
+
+
+def episode_bar() -> Progress:
+    """Return a progress bar over episodes, with the time left."""
+    return Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+        transient=True,
+        speed_estimate_period=600.0,  # an episode may take a minute
+    )
+
+
 def _run_all(
     controllers: Sequence[Controller],
     scenarios: Sequence[str],
@@ -77,16 +104,7 @@ def _run_all(
     records: list[Record],
 ) -> None:
     """Append the records of all episodes to ``records`` as they end, with a progress bar."""
-    bar = Progress(
-        TextColumn("[bold]{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=Console(file=sys.stderr),
-        transient=True,
-    )
-    with bar:
+    with episode_bar() as bar:
         task = bar.add_task("", total=len(controllers) * len(scenarios) * episodes)
 
         def keep(record: Record) -> None:

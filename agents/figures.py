@@ -36,7 +36,7 @@ _BAND = (10.0, 90.0)
 HOLDABLE_MM = {"parallel": 19.0, "antiparallel": 12.8}
 """Least separation at which robots side by side can be held still, by their headings."""
 
-_DPI = 110
+DPI = 110
 _ARROWS = 13
 
 
@@ -214,4 +214,4 @@ def _distance(poses: Floats) -> Floats:
 
 
 def _figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")

@@ -7,6 +7,7 @@ import io
 import json
 import platform
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -68,11 +69,7 @@ def write_summary(records: list[Record], folder: Path) -> list[Summary]:
     rows = summarise(records)
     text = json.dumps({"rows": [asdict(row) for row in rows]}, indent=1, allow_nan=False)
     write_file(folder / "summary.json", (text + "\n").encode())
-    table = io.StringIO()
-    writer = csv.DictWriter(table, [field.name for field in fields(Episode)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(measure(record)) for record in records)
-    write_file(folder / "episodes.csv", table.getvalue().encode())
+    write_file(folder / "episodes.csv", as_csv(asdict(measure(record)) for record in records))
     (folder / "records").mkdir(exist_ok=True)
     written = []
     for scenario, of_scenario in by_scenario(records).items():
@@ -81,6 +78,15 @@ def write_summary(records: list[Record], folder: Path) -> list[Summary]:
             save(episodes, folder / "records" / written[-1])
     _drop_others(folder / "records", ["*_*.npz"], written)
     return rows
+
+
+def as_csv(episodes: Iterable[Mapping[str, object]]) -> bytes:
+    """Return the fields of ``metrics.Episode`` as CSV, one row per episode."""
+    table = io.StringIO()
+    writer = csv.DictWriter(table, [field.name for field in fields(Episode)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(episodes)
+    return table.getvalue().encode()
 
 
 def _drop_others(folder: Path, patterns: list[str], written: list[str]) -> None:
@@ -143,7 +149,7 @@ def write_report(records: list[Record], folder: Path, command: str) -> list[Summ
         written += [*pictures, f"replay-{scenario}.gif"]
     _drop_others(folder, ["paths-*.png", "errors-*.png", "separation-*.png", "replay-*.gif"], written)
     page += ["", "## What the numbers mean", "", _MEANING, "", "## Versions", ""]
-    page += [f"Python {platform.python_version()}, " + ", ".join(f"{name} {_version(name)}" for name in _PACKAGES)]
+    page += [", ".join(f"{name} {number}" for name, number in versions().items())]
     write_file(folder / "report.md", ("\n".join(page) + "\n").encode())
     return rows
 
@@ -202,6 +208,11 @@ def _median(value: float | None) -> tuple[str, str]:
 def file_name(controller: str) -> str:
     """Return the part of file names that stands for a controller."""
     return re.sub(r"[^\w.-]+", "-", controller)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    return {"Python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
 
 
 def _version(package: str) -> str:

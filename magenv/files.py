@@ -1,7 +1,8 @@
-"""Folders and files that runs write: proven before, and never half a file."""
+"""Folders and files that runs write: proven before, and never half a file; what they were made from, in one number."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -35,3 +36,16 @@ def write_file(path: Path, content: bytes) -> None:
         os.replace(new, path)
     finally:
         new.unlink(missing_ok=True)
+
+
+def digest_of(folder: Path) -> str:
+    """Return a number, in hexadecimal, that changes with the name or content of any file below ``folder``.
+
+    What Python compiles from the sources does not count.
+    """
+    total = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder)
+        if path.is_file() and "__pycache__" not in name.parts:
+            total.update(str(name).encode() + b"\0" + path.read_bytes())
+    return total.hexdigest()

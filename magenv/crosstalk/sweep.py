@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -16,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from magenv.crosstalk.tasks import TASKS, Row
-from magenv.files import check_output_dir, write_file
+from magenv.files import check_output_dir, digest_of, write_file
 from magenv.params import InputError
 
 Engine = Literal["local", "dask", "ray"]
@@ -38,17 +39,9 @@ class Task(NamedTuple):
         return f"{self.table}-{hashlib.sha256(told.encode()).hexdigest()[:24]}"
 
 
-_digest: list[str] = []
-
-
+@functools.cache
 def _sources() -> str:
-    if not _digest:
-        total = hashlib.sha256()
-        package = Path(__file__).parent.parent
-        for path in sorted(package.rglob("*.py")):
-            total.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-        _digest.append(total.hexdigest())
-    return _digest[0]
+    return digest_of(Path(__file__).parent.parent)
 
 
 def compute(task: Task) -> list[Row]:
