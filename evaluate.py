@@ -59,7 +59,7 @@ def main() -> None:
         for reason in unfit:
             print(f"left out: {reason}", file=sys.stderr)
     else:
-        chosen = [controller(name, c.n_epm, c.control_hz) for name in c.controllers]
+        chosen = [controller(name, c.n_epm, c.control_hz, c.plant) for name in c.controllers]
     if c.ladder == "none":
         out = c.out or Path("runs/evaluate")
         compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, out, command_line())

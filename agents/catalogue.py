@@ -7,11 +7,12 @@ from pathlib import Path
 from agents.baseline import paper_baseline, tuned_baseline
 from agents.controller import Controller, Idle, Random
 from agents.learned import Learned
+from agents.predictive import Predictive
 from agents.store import CARD
 from magenv.params import InputError, require
 
 _SHIPPED = Path(__file__).parent / "data"
-_CLASSICAL = ("baseline", "tuned", "idle", "random")
+_CLASSICAL = ("baseline", "tuned", "predictive", "idle", "random")
 
 
 def names() -> list[str]:
@@ -31,8 +32,10 @@ def defaults(n_epm: int, control_hz: float) -> tuple[list[Controller], list[str]
     return chosen, unfit
 
 
-def controller(name: str, n_epm: int = 2, control_hz: float = 2.0) -> Controller:
+def controller(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper") -> Controller:
     """Return the controller of this name, or the agent in this folder, for a number of EPMs and a control rate.
+
+    ``plant`` names the kind of plant acted on, of which ``predictive`` takes its nominal parameters.
 
     Raises
     ------
@@ -44,6 +47,8 @@ def controller(name: str, n_epm: int = 2, control_hz: float = 2.0) -> Controller
             return paper_baseline(n_epm, control_hz)
         case "tuned":
             return tuned_baseline(n_epm, control_hz)
+        case "predictive":
+            return Predictive(n_epm, control_hz, plant)
         case "idle":
             return Idle(n_epm)
         case "random":

@@ -160,14 +160,14 @@ def _episodes(
 
 def _episode(name: str, ladder: Ladder, scenario: str, seed: int) -> Record:
     """Return the record of one episode, in a process that has nothing but the controller's name."""
-    controller = _controller(name, ladder.n_epm, ladder.control_hz)
+    controller = _controller(name, ladder.n_epm, ladder.control_hz, ladder.plant)
     (record,) = run(controller, scenario, ladder.plant, ladder.n_epm, ladder.control_hz, episodes=1, seed=seed)
     return record
 
 
 @functools.lru_cache(maxsize=1)
-def _controller(name: str, n_epm: int, control_hz: float) -> Controller:
-    return catalogue.controller(name, n_epm, control_hz)
+def _controller(name: str, n_epm: int, control_hz: float, plant: str) -> Controller:
+    return catalogue.controller(name, n_epm, control_hz, plant)
 
 
 def _rung(summary: Summary, anti: bool, separation_mm: float, above: Sequence[Rung]) -> Rung:

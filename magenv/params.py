@@ -191,11 +191,15 @@ class Plant:
 
 PLANTS: dict[str, Plant] = {
     "paper": Plant(),
+    # Ends of the ranges of drag (see README, "Where the numbers come from").
+    "low-drag": Plant(body=Body(drag_linear_nspm=0.15, drag_rotational_nmsprad=5e-5)),
+    "high-drag": Plant(body=Body(drag_linear_nspm=0.4, drag_rotational_nmsprad=2e-4)),
     # Data sheets of the UR5e and UR10e: typical speed of the tool 1 m/s, wrists 180 degrees/s.
     "moving": Plant(epm_speed_mps=1.0, epm_turn_radps=math.pi),
 }
-"""The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation. ``moving``: the same, but the
-EPMs move there at finite speed, and act on the robots on the way."""
+"""The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation. ``low-drag``,
+``high-drag``: the same at the ends of what robots' drag may be. ``moving``: as ``paper``, but the EPMs move there at
+finite speed, and act on the robots on the way."""
 
 
 CONTROL_HZ_RANGE = (0.01, 1000.0)
