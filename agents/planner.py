@@ -16,10 +16,11 @@ from magenv.actions import planar_target
 from magenv.allocation import allocate
 from magenv.forecast import STATE, Goal, Motion
 from magenv.horizon import Scratch, land, plan
-from magenv.manoeuvre import Arms
+from magenv.manoeuvre import Arms, move
 from magenv.params import Plant, System
-from magenv.poses import to_cartesian
+from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
 from magenv.sensitivity import COORDINATES, Model
+from magenv.travel import Motion as Limits
 from magenv.wrench import WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
@@ -67,10 +68,10 @@ class Planner:
     def __init__(self, system: System, plant: Plant, period_s: float, substeps: int, stages: int) -> None:
         self._system, self._plant, self._period_s, self._stages = system, plant, period_s, stages
         self.model = Model.of(system, plant, period_s / substeps)
-        self._arms = Arms.of(system)
-        n = system.n_epm
-        self._motion = Motion.of(n, substeps, False)
-        self._parts = [Motion.of(n, max(1, round(share * substeps)), False) for share in PARTS]
+        n, travels = system.n_epm, not plant.epms_jump
+        self._arms = Arms(Limits.of(system, plant, self.model.substep, substeps), substeps, travels)
+        self._motion = Motion.of(n, substeps, travels)
+        self._parts = [Motion.of(n, max(1, round(share * substeps)), travels) for share in PARTS]
         self._scratch, self._single = Scratch.of(stages, n, 1), Scratch.of(1, n, 1)
 
     def plan(self, problem: Problem, last: Floats, rng: np.random.Generator) -> tuple[Floats, float, bool]:
@@ -81,18 +82,37 @@ class Planner:
         best, sought = last.copy(), False
         cost = self._polish(problem, best)
         turn, enough = 0, ENOUGH * self._stages
-        while not cost < enough and turn < (SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES):
+        # EPMs that travel come only where the last plan, too, can be bent to
+        most = 0 if self._arms.travels else SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
+        while not cost < enough and turn < most:
             new, commands = self._from_statics(problem, cost, rng)
             if new < cost:
                 best, cost, sought = commands, new, True
+                most = SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
             turn += 1
         return best, cost, sought
+
+    def path(self, before: Floats, command: Floats) -> Floats:
+        """Return where the EPMs are in each substep (M, N, 6) of a command's time, the ones before standing there."""
+        bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
+        move(self._arms, before, command, bases, self._motion, False)
+        return self._motion.path[self._motion.which]
 
     def _polish(self, problem: Problem, commands: Floats) -> float:
         """Improve commands (H, N, 6) in place; return their cost."""
         return plan(
-            self.model, problem.state, problem.pushing, problem.doubt, problem.goal, self._arms, self._motion,
-            problem.before, CONVERGED, ITERATIONS, self._scratch, commands,
+            self.model,
+            problem.state,
+            problem.pushing,
+            problem.doubt,
+            problem.goal,
+            self._arms,
+            self._motion,
+            problem.before,
+            CONVERGED,
+            ITERATIONS,
+            self._scratch,
+            commands,
         )[0]
 
     def _from_statics(self, problem: Problem, least: float, rng: np.random.Generator) -> tuple[float, Floats]:
@@ -108,7 +128,11 @@ class Planner:
             land(self.model, state, problem.pushing, goal, self._arms, self._motion, before, commands[-1])
             before = commands[-1]
             later = Problem(
-                state, problem.pushing, np.zeros((STATE, STATE)), goal._replace(references=goal.references[stage:]), before
+                state,
+                problem.pushing,
+                np.zeros((STATE, STATE)),
+                goal._replace(references=goal.references[stage:]),
+                before,
             )
             found = [self._held_on_the_way(later, rng) for _ in range(LATER_SEARCHES)]
             commands.append(min(found, key=lambda pair: pair[0])[1][0])
@@ -133,8 +157,17 @@ class Planner:
             way = np.concatenate([problem.state[:COORDINATES] + share * ahead, ahead / self._period_s])
             part = problem.goal._replace(marks=np.array([len(motion.which)]), references=way[None, None])
             cost, _ = plan(
-                self.model, problem.state, problem.pushing, problem.doubt if whole else none,
-                problem.goal if whole else part, self._arms, motion, problem.before, CONVERGED,
-                ITERATIONS if whole else SHORT_ITERATIONS, self._single, command,
+                self.model,
+                problem.state,
+                problem.pushing,
+                problem.doubt if whole else none,
+                problem.goal if whole else part,
+                self._arms,
+                motion,
+                problem.before,
+                CONVERGED,
+                ITERATIONS if whole else SHORT_ITERATIONS,
+                self._single,
+                command,
             )
         return cost, command

@@ -16,7 +16,7 @@ from agents.planner import ENOUGH, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Goal, Motion
 from magenv.observer import KNOWN, Noise, correct, forecast
-from magenv.params import PLANTS, Plant, System, TaskParams, choose
+from magenv.params import PLANTS, Plant, System, TaskParams, choose, require
 from magenv.poses import from_cartesian
 from magenv.sensitivity import COORDINATES
 from magenv.task import Frame, Layout, ObservationMode, unpack
@@ -30,6 +30,13 @@ POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
 # What finite numbers and the neglected curvature of the motion leave in doubt, however exact the plant is.
 _FLOOR_M, _FLOOR_RAD, _FLOOR_MPS, _FLOOR_RADPS = 3e-6, 3e-6, 1e-5, 3e-5
 _PUSH_N, _PUSH_NM = 3e-5, 3e-8
+
+_DRIFT_N, _DRIFT_NM = 1e-2, 1e-4
+"""By what a push drifts in a second, per mismatch of the parameters: the EPMs move, and so does what is wrong of them."""
+_AMISS_N, _AMISS_NM = 2e-2, 3e-4
+"""Push at the beginning, per mismatch."""
+WANDER = 0.0
+"""Weight of a command's change where the EPMs travel."""
 
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
 """How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
@@ -46,6 +53,10 @@ class Memory:
     """(18, 18)"""
     commands: Floats
     """(H, N, 6) the plan from the present instant on."""
+    before: Floats
+    """(N, 6) the last command."""
+    paths: Floats
+    """(2 M, N, 6) EPMs in each substep of the times of the last command but one, and of the last."""
 
 
 @dataclass
@@ -80,9 +91,7 @@ class Predictive:
     observation: ObservationMode = "full"
     frame: Frame = "robots"
 
-    def __init__(
-        self, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper", name: str = "predictive"
-    ) -> None:
+    def __init__(self, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper", name: str = "predictive") -> None:
         self.name = name
         self._system, self._plant = System(n_epm=n_epm), choose(PLANTS, "plant", plant)
         self._period_s = period = TaskParams(control_hz=control_hz).period_s
@@ -90,12 +99,18 @@ class Predictive:
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
         self._stages = min(4, max(1, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
-        self._held = Motion.of(n_epm, self._substeps, False)
+        self._held = Motion.of(n_epm, self._substeps, True)
+        self._lag = round(self._plant.latency_s / (period / self._substeps))
+        require(
+            self._lag <= self._substeps, "control_hz", f"at most {1 / max(self._plant.latency_s, 1e-9):g}", control_hz
+        )
         self._weights = np.concatenate(
             [_per_coordinate(1 / POSITION_M, 1 / HEADING_RAD), _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)]
         )
         self._weights[COORDINATES:] *= SETTLING_S
         self._noise = _noise(self._plant)
+        amiss = self._plant.mismatch
+        self._pushed = _per_coordinate(_PUSH_N + _AMISS_N * amiss, _PUSH_NM + _AMISS_NM * amiss) ** 2
         self._floor = np.concatenate(
             [_per_coordinate(0.3 * _FLOOR_M, _FLOOR_RAD), _per_coordinate(_FLOOR_MPS, _FLOOR_RADPS)]
         )
@@ -126,13 +141,18 @@ class Predictive:
         for i in range(n):
             memory = None if episode_start is not None and episode_start[i] else state.rows[i]
             measured = parts.robots[i].reshape(-1)
-            memory = self._begin(measured, epms[i]) if memory is None else self._update(memory, measured, epms[i])
+            if memory is None:
+                memory = self._begin(measured, epms[i])
+            else:
+                self._update(memory, measured, epms[i])
             goal = self._goal(parts.reference[i].reshape(-1, COORDINATES))
             state.status[i] = self._decide(memory, goal, epms[i], self._rngs[i])
             state.rows[i] = memory
             command = memory.commands[0]
             actions[i] = pose_to_action(from_cartesian(command[:, :3], command[:, 3:]), self._system)
-            memory.commands = np.concatenate([memory.commands[1:], memory.commands[-1:]])
+            path = self._planner.path(memory.before, command)
+            memory.paths = np.concatenate([memory.paths[self._substeps :], path])
+            memory.before, memory.commands = command, np.concatenate([memory.commands[1:], memory.commands[-1:]])
         return actions.reshape(*np.shape(observation)[:-1], -1), state
 
     def _begin(self, measured: Floats, epms: Floats) -> Memory:
@@ -140,15 +160,21 @@ class Predictive:
         known, covariance = np.zeros(KNOWN), np.zeros((KNOWN, KNOWN))
         known[:COORDINATES] = measured
         unknown = _per_coordinate(_START_MPS, _START_RADPS) ** 2
-        covariance[np.diag_indices(KNOWN)] = np.concatenate([self._noise.measured, unknown, self._noise.drift])
-        return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0))
+        covariance[np.diag_indices(KNOWN)] = np.concatenate([self._noise.measured, unknown, self._pushed])
+        paths = np.repeat(epms[None], 2 * self._substeps, axis=0)
+        return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0), epms, paths)
 
-    def _update(self, memory: Memory, measured: Floats, epms: Floats) -> Memory:
-        """Carry the estimate over the last hold, of EPMs (N, 6), and correct it."""
-        self._held.path[0] = epms
-        forecast(self._planner.model, self._held, 0, self._substeps, self._noise, memory.known, memory.covariance)
+    def _update(self, memory: Memory, measured: Floats, epms: Floats) -> None:
+        """Carry the estimate over the last hold and correct it, then go on to the present one."""
+        if self._lag == 0 and self._plant.epms_jump:
+            memory.paths[self._substeps :] = epms  # what was commanded, as it was carried out
+        self._follow(memory.paths, 0, self._substeps, memory.known, memory.covariance)
         correct(measured, self._noise, memory.known, memory.covariance)
-        return memory
+
+    def _follow(self, paths: Floats, first: int, last: int, known: Floats, covariance: Floats) -> None:
+        """Carry an estimate over substeps of a hold, in which commands act late."""
+        self._held.path[:] = paths[self._substeps - self._lag : 2 * self._substeps - self._lag]
+        forecast(self._planner.model, self._held, first, last, self._noise, known, covariance)
 
     def _goal(self, references: Floats) -> Goal:
         """Return the goal at the ends of the commands' times, from the references (5, 6) told."""
@@ -156,15 +182,29 @@ class Predictive:
         turn[:, 2::3] = np.remainder(turn[:, 2::3] + math.pi, 2 * math.pi) - math.pi
         rates = np.concatenate([1.5 * turn[:1] - 0.5 * turn[1:2], 0.5 * (turn[:-1] + turn[1:])]) / self._period_s
         states = np.concatenate([references[:4], rates], axis=-1)
-        return Goal(np.array([self._substeps]), states[: self._stages, None], self._weights, 0.0)
+        share = self._lag / self._substeps  # commands act late, and so do their times end
+        states[:-1, :COORDINATES] += share * turn[:3]
+        states[:-1, COORDINATES:] += share * np.diff(states[:, COORDINATES:], axis=0)
+        return Goal(
+            np.array([self._substeps]),
+            states[: self._stages, None],
+            self._weights,
+            0.0 if self._plant.epms_jump else WANDER,
+        )
 
     def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
         """Write the best plan found into the memory; return how it was come by."""
-        doubt = np.linalg.cholesky(memory.covariance[:STATE, :STATE] + np.diag(self._floor**2))
-        problem = Problem(memory.known[:STATE].copy(), memory.known[STATE:].copy(), doubt, goal, epms)
+        known, covariance, before = memory.known.copy(), memory.covariance.copy(), memory.before
+        if self._lag > 0:  # until the command acts
+            paths = np.concatenate([memory.paths[self._substeps :], memory.paths[-self._substeps :]])
+            self._follow(paths, 0, self._lag, known, covariance)
+        elif self._plant.epms_jump:
+            before = epms
+        doubt = np.linalg.cholesky(covariance[:STATE, :STATE] + np.diag(self._floor**2))
+        problem = Problem(known[:STATE].copy(), known[STATE:].copy(), doubt, goal, before)
         memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)
         if not math.isfinite(cost):
-            memory.commands = np.repeat(epms[None], self._stages, axis=0)
+            memory.commands = np.repeat(before[None], self._stages, axis=0)
             return FALLBACK
         return UNSOLVED if cost > ENOUGH * self._stages else SOUGHT if sought else CONVERGED
 
@@ -175,8 +215,9 @@ _START_MPS, _START_RADPS = 1e-3, 1e-3
 
 def _noise(plant: Plant) -> Noise:
     """Return what the filter reckons with on a plant of this kind."""
+    position, heading = math.hypot(plant.noise_position_m, _FLOOR_M), math.hypot(plant.noise_heading_rad, _FLOOR_RAD)
     return Noise(
-        _per_coordinate(_FLOOR_M, _FLOOR_RAD) ** 2,
-        _per_coordinate(_PUSH_N, _PUSH_NM) ** 2,
+        _per_coordinate(position, heading) ** 2,
+        _per_coordinate(_PUSH_N + _DRIFT_N * plant.mismatch, _PUSH_NM + _DRIFT_NM * plant.mismatch) ** 2,
         _per_coordinate(0.1 * _FLOOR_M, 0.1 * _FLOOR_RAD) ** 2,
     )

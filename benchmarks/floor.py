@@ -102,7 +102,7 @@ def products(settings: Settings) -> int:
     cached: Any = hold_rows
     world, idle = Episodes(16, settings).world, np.zeros(16, np.bool_)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
-    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(settings.n_epm, 16, False))
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(settings.n_epm, 16))
     (assembly,) = fresh.inspect_asm().values()
     counts = [len(_PRODUCT.findall(part)) for part in re.split(r"^\.L\w+:$", assembly, flags=re.M)]
     return sum(count for count in counts if count >= _LOOP)

@@ -76,7 +76,7 @@ class Physics(NamedTuple):
     ipm_moment: Floats
     """(n, 2) A m^2."""
     epm_moment: Floats
-    """(n,) A m^2."""
+    """(n, N) A m^2."""
     body_diameter: float
     """m."""
     wall_radius: float
@@ -92,7 +92,7 @@ class Physics(NamedTuple):
             drag_linear=np.full((n, 2), body.drag_linear_nspm),
             drag_rotational=np.full((n, 2), body.drag_rotational_nmsprad),
             ipm_moment=np.full((n, 2), system.ipm_moment_am2),
-            epm_moment=np.full(n, system.epm_moment_am2),
+            epm_moment=np.full((n, system.n_epm), system.epm_moment_am2),
             body_diameter=body.diameter_m,
             wall_radius=plant.workspace_radius_m,
         )
@@ -179,13 +179,11 @@ def place_epm(
 
 
 @law
-def jump(lanes: Floats, i: int, row: int, moment: float, epms: Floats, targets: Floats) -> None:
-    """Put the EPMs (n, N, 6) of a row where they are commanded, and into lane ``i``."""
-    for k in range(epms.shape[1]):
-        for j in range(EPM_SIZE):
-            epms[row, k, j] = targets[row, k, j]
-        x, y, z = epms[row, k, 0], epms[row, k, 1], epms[row, k, 2]
-        place_epm(lanes, i, k, moment, x, y, z, epms[row, k, 3], epms[row, k, 4], epms[row, k, 5])
+def place_all(lanes: Floats, i: int, moments: Floats, epms: Floats) -> None:
+    """Put EPMs (N, 6) of moments (N,) in A m^2 into lane ``i``."""
+    for k in range(len(epms)):
+        e = epms[k]
+        place_epm(lanes, i, k, moments[k], e[0], e[1], e[2], e[3], e[4], e[5])
 
 
 @kernel

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
 from magenv.params import PLANTS, InputError, System, TaskParams, choose, is_whole, require
-from magenv.poses import POSE_SIZE
-from magenv.starts import Starts
+from magenv.poses import EPM_SIZE, POSE_SIZE
+from magenv.starts import Starts, holding_epms
 from magenv.state import State, packed
 from magenv.steps import begin_episodes, clip, step_kernel, tell_rows
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode
 from magenv.trajectories import named_trajectory
+from magenv.uncertainty import is_uncertain, nominal
 from magenv.workers import Workers
 from magenv.world import Measurements, World
 
@@ -105,13 +106,14 @@ class Episodes:
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.actions.size,), np.float32)
         self._shape = (n, self.layout.size)
-        self._starts = Starts(n, trajectory is None, self._workers)
+        self._starts = Starts(n, trajectory is None, is_uncertain(plant), self._workers)
         self.state = self._state(n, bounds)
         self._prepare()
 
     def _state(self, n: int, bounds: Observations) -> State:
         """Return the arrays of world, actions and starts, by name, with those of the task."""
         w, system, task, physics, n_epm = self.world, self.system, self.task, self.world.physics, self.settings.n_epm
+        plant = self.plant
         return State(
             robots=w.robots,
             epms=w.epms,
@@ -130,6 +132,22 @@ class Episodes:
             diameter=physics.body_diameter,
             wall_radius=physics.wall_radius,
             motion=w.motion,
+            routes=w.routes,
+            queue=w.queue,
+            slow=w.slow,
+            rubs=(plant.disturbance_n, plant.dry_friction_n, plant.dry_friction_nm),
+            uncertain=is_uncertain(plant),
+            plant_keys=self._starts.plant_keys,
+            plant_key=np.zeros(n, np.uint64),
+            mismatch=plant.mismatch,
+            nominal=nominal(system, plant),
+            inertia=physics.inertia,
+            drag_linear=physics.drag_linear,
+            drag_rotational=physics.drag_rotational,
+            ipm_moments=physics.ipm_moment,
+            substep=w.period_s / w.substeps,
+            noise_position=plant.noise_position_m,
+            noise_heading=plant.noise_heading_rad,
             targets=np.zeros(w.epms.shape),
             projected=np.zeros(n, np.bool_),
             **self.actions.constants(),
@@ -137,6 +155,7 @@ class Episodes:
             used=self._starts.used,
             position_sd=task.start_position_sd_m,
             heading_sd=task.start_heading_sd_rad,
+            held_epms=self._held_epms(n),
             every=np.ones(n, np.bool_),
             measured=np.zeros((n, 2, 3)),
             before=np.zeros((n, 2, 3)),
@@ -151,6 +170,15 @@ class Episodes:
             action=np.zeros((1, self.actions.size)),
             observation=np.zeros((1, self.layout.size), np.float32),
         )
+
+    def _held_epms(self, n: int) -> Floats:
+        """Return room for EPMs that hold the robots at the start, filled where all rows start alike; none at home."""
+        if self.plant.latency_s == 0.0:
+            return np.zeros((0, self.settings.n_epm, EPM_SIZE))
+        trajectory = named_trajectory(self.settings.scenario)
+        if trajectory is None:
+            return np.zeros((max(n, 2), self.settings.n_epm, EPM_SIZE))
+        return holding_epms(trajectory.at(0.0), self.system)[None]
 
     def _prepare(self) -> None:
         self.packed = packed(self.state)
@@ -171,6 +199,9 @@ class Episodes:
     def draw(self, mask: Bools) -> None:
         """Draw the next episode of each row where ``mask`` says, from the row's generator."""
         self._starts.draw(mask, self.world.coefficients, self.world.duration_s)
+        if len(self.state.held_epms) > 1:  # each row has a trajectory of its own
+            for row in np.flatnonzero(mask).tolist():
+                self.state.held_epms[row] = holding_epms(self.world.trajectory(row).at(0.0), self.system)
 
     def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.angles import wrap
+from magenv.angles import sincos, wrap
 from magenv.arithmetic import dot2
-from magenv.dynamics import TOUCH, WALL, advance, jump, may_touch, resolve_contact
+from magenv.dynamics import TOUCH, WALL, advance, may_touch, place_all, resolve_contact
 from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
@@ -23,6 +23,7 @@ from magenv.lanes import (
     CONSTANTS_SIZE,
     CONTACT,
     DONE,
+    FRICTION,
     HEADING1,
     HEADING2,
     HEADING_END,
@@ -32,12 +33,14 @@ from magenv.lanes import (
     POSITION_END,
     POSITION_ERROR,
     PROGRESS,
+    PUSH_X1,
     SEGMENT,
     SEGMENT_RATE,
     SEPARATION_MIN,
     SEPARATION_TRACKED,
     START,
     STATE_SIZE,
+    TURN_FRICTION,
     X1,
     X2,
     Y1,
@@ -45,7 +48,7 @@ from magenv.lanes import (
     fields,
 )
 from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
-from magenv.travel import Motion, arrive, carry, give_way, go_on, set_off
+from magenv.travel import Motion, carry, command, give_way, go_on, is_due, put_down, set_off, take_up
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -53,6 +56,8 @@ Bools = NDArray[np.bool_]
 LOSSES = ("none", "deviation", "touch", "wall")
 """Kinds of loss of control by code: too far from the reference, bodies touched, wall reached."""
 _DEVIATION, _TOUCH, _WALL = 1, 2, 3
+AT_ONCE, LATE, TRAVELLING = range(3)
+"""How commands act: EPMs are there as the hold begins, or some substeps later, or travel there, perhaps later."""
 
 
 @law
@@ -130,6 +135,16 @@ def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
     return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
 
 
+@law
+def _disturb(lanes: Floats, i: int, slow: Floats, rubs: tuple[float, float, float], now: float) -> None:
+    """Write what pushes and rubs the robots of lane ``i`` in the hold that begins at ``now`` (s)."""
+    amplitude, lanes[FRICTION, i], lanes[TURN_FRICTION, i] = rubs
+    for robot in range(2):
+        for axis in range(2):
+            sine, _ = sincos(slow[robot, 0] * now + slow[robot, 1 + axis])
+            lanes[PUSH_X1 + 2 * axis + robot, i] = amplitude * sine
+
+
 @kernel
 def hold_rows(
     first: int,
@@ -153,19 +168,29 @@ def hold_rows(
     diameter: float,
     wall_radius: float,
     motion: Motion,
+    routes: Floats,
+    queue: Floats,
+    slow: Floats,
+    rubs: tuple[float, float, float],
     magnets: tuple[int, ...],
     side_by_side: tuple[int, ...],
     moving: tuple[int, ...],
+    rubbing: tuple[int, ...],
 ) -> None:
     """Hold commands for one control period or until control is lost, several rows at a time.
 
     A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
-    compute on, unseen. The lengths of the last three tuples, which are types to numba, are the numbers of EPMs and of
-    lanes, and whether the EPMs travel: constants of the machine code, so that the magnets are unrolled and the lanes
-    vectorised.
+    compute on, unseen. The lengths of the last tuples, which are types to numba, are the numbers of EPMs and of lanes,
+    how commands act (``AT_ONCE``, ``LATE``, ``TRAVELLING``) and whether the plant is rough: constants of the machine
+    code, so that the magnets are unrolled and the lanes vectorised.
+
+    ``routes`` (n, N, 48) is how EPMs move from hold to hold, ``queue`` (n, 1 + wait, N, 6) the commands that do not act
+    yet, ``slow`` (n, 2, 3) angular frequencies (rad/s) and phases of x and y of the force that
+    disturbs each robot, ``rubs`` its amplitude (N) and dry friction (N, N m).
     """
     wide_vectors()
-    n_epm, width, travels = len(magnets), len(side_by_side), len(moving) > 0
+    n_epm, width, rough = len(magnets), len(side_by_side), len(rubbing) > 0
+    late, travels = len(moving) >= LATE, len(moving) >= TRAVELLING
     lanes, bodies = np.zeros((fields(n_epm, travels), width)), np.empty((2, STATE_SIZE))
     rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
     h, upcoming, busy, idle = period / substeps, first, 0, True
@@ -185,9 +210,16 @@ def hold_rows(
                     for j in range(CONSTANTS_SIZE):
                         lanes[CONSTANTS + j, i] = constants[row, j]
                     if travels:
-                        set_off(lanes, i, row, epm_moment[row], epms, targets, motion)
+                        take_up(lanes, i, epm_moment[row], epms[row], routes[row])
+                    elif late:
+                        place_all(lanes, i, epm_moment[row], epms[row])
                     else:
-                        jump(lanes, i, row, epm_moment[row], epms, targets)
+                        epms[row] = targets[row]
+                        place_all(lanes, i, epm_moment[row], epms[row])
+                    if late:
+                        queue[row, step[row] % queue.shape[1]] = targets[row]
+                    if rough:
+                        _disturb(lanes, i, slow[row], rubs, step[row] * period)
                     which = trajectory_of(row, len(duration))
                     lanes[START, i], lanes[DONE, i], lanes[CONTACT, i] = step[row] * period, 0.0, 0.0
                     lanes[SEGMENT_RATE, i] = SEGMENTS / duration[which]
@@ -198,6 +230,26 @@ def hold_rows(
                     lanes[SEPARATION_TRACKED, i] = numbers[SEPARATION_TRACKED - MEASURED, row] ** 2
             if busy == 0:
                 return
+        rare = False
+        if late:
+            for i in range(width):
+                flagged[i] = (rows[i] >= 0) & (lanes[DONE, i] == motion.lag)
+                if travels:
+                    flagged[i] |= (rows[i] >= 0) & is_due(lanes, i, n_epm)
+                rare |= flagged[i]
+            if rare:
+                for i in range(width):
+                    row = rows[i]
+                    if flagged[i]:
+                        sent = step[row] - motion.wait
+                        if lanes[DONE, i] == motion.lag and sent >= 0:
+                            if travels:
+                                command(lanes, i, queue[row, sent % queue.shape[1]])
+                            else:
+                                epms[row] = queue[row, sent % queue.shape[1]]
+                                place_all(lanes, i, epm_moment[row], epms[row])
+                        if travels:
+                            set_off(lanes, i, n_epm, motion)
         rare = False
         if travels:
             for i in range(width):
@@ -211,7 +263,7 @@ def hold_rows(
         for i in range(width):
             if travels:
                 carry(lanes, i, n_epm)
-            advance(lanes, i, n_epm, h, False)
+            advance(lanes, i, n_epm, h, rough)
             flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
             rare |= flagged[i]
         if rare:
@@ -233,7 +285,7 @@ def hold_rows(
                     for j in range(2 * STATE_SIZE):
                         robots[row, j % 2, j // 2] = lanes[X1 + j, i]
                     if travels:
-                        arrive(lanes, i, row, epms)
+                        put_down(lanes, i, epms[row], routes[row])
                     for j in range(MEASURED_SIZE):
                         numbers[j, row] = lanes[MEASURED + j, i]
                     numbers[POSITION_ERROR - MEASURED, row] /= lanes[DONE, i]
@@ -246,15 +298,15 @@ def hold_rows(
                     busy -= 1
 
 
-def hold_shape(n_epm: int, width: int, travels: bool) -> tuple[tuple[int, ...], ...]:
+def hold_shape(n_epm: int, width: int, moves: int = AT_ONCE, rough: bool = False) -> tuple[tuple[int, ...], ...]:
     """Return the last arguments of ``hold_rows``."""
-    return (0,) * n_epm, (0,) * width, (0,) * travels
+    return (0,) * n_epm, (0,) * width, (0,) * moves, (0,) * rough
 
 
 @functools.cache
-def hold_kernel(n_epm: int, width: int, travels: bool) -> Callable[..., None]:
-    """Return ``hold_rows`` for a number of EPMs and of lanes, EPMs of finite speed or not."""
-    shape = hold_shape(n_epm, width, travels)
+def hold_kernel(n_epm: int, width: int, moves: int, rough: bool) -> Callable[..., None]:
+    """Return ``hold_rows`` for a number of EPMs and of lanes, a way in which commands act, a rough plant or not."""
+    shape = hold_shape(n_epm, width, moves, rough)
 
     def hold(*arguments: Any) -> None:
         hold_rows(*arguments, *shape)

@@ -26,8 +26,8 @@ from magenv.cholesky import add_product, add_transposed_product, factorise, solv
 from magenv.forecast import STATE, Goal, Motion, roll
 from magenv.kernels import kernel
 from magenv.local import local_basis, seen_from, shift
-from magenv.manoeuvre import Arms, move, within_reach
-from magenv.poses import EPM_SIZE, POSE_SIZE, project_epms
+from magenv.manoeuvre import Arms, allow, move
+from magenv.poses import EPM_SIZE, POSE_SIZE
 from magenv.risk import lean_on, risk
 from magenv.sensitivity import Model
 
@@ -106,7 +106,14 @@ def _change(
 
 @kernel
 def _linearise(
-    model: Model, pushing: Floats, goal: Goal, arms: Arms, motion: Motion, before: Floats, doubt: Floats, commands: Floats,
+    model: Model,
+    pushing: Floats,
+    goal: Goal,
+    arms: Arms,
+    motion: Motion,
+    before: Floats,
+    doubt: Floats,
+    commands: Floats,
     s: Scratch,
 ) -> tuple[float, float]:
     """Write states, residuals and derivatives of all commands' times; return the cost, and the scale of ``s.lean``."""
@@ -118,7 +125,7 @@ def _linearise(
         old = before if stage == 0 else commands[stage - 1]
         for k in range(len(before)):
             local_basis(commands[stage, k], s.bases[stage + 1, k])
-        move(arms, old, commands[stage], s.bases[stage : stage + 2], motion)
+        move(arms, old, commands[stage], s.bases[stage : stage + 2], motion, True)
         s.states[stage + 1] = s.states[stage]
         sensitivity = np.zeros((STATE, STATE + 2 * u - first))
         for i in range(STATE):
@@ -166,7 +173,7 @@ def _backward(commands: Floats, arms: Arms, damping: float, s: Scratch) -> bool:
         add_transposed_product(onward, ahead, q)
         add_transposed_product(j, r, g)
         add_transposed_product(onward, slope, g)
-        _held(commands[stage], g[y:, 0], arms.r_min, arms.r_max, held)
+        _held(commands[stage], g[y:, 0], arms.limits.r_min, arms.limits.r_max, held)
         quu[:], quy[:], gu[:] = q[y:, y:], q[y:, :y], g[y:]
         for i in range(u):
             for k in range(i + 1):
@@ -226,10 +233,9 @@ def _forward(
         trial[:] = commands[stage]
         for k in range(n_epm):
             at = POSE_SIZE * k
-            shift(trial[k], s.bases[stage + 1, k], step[at : at + POSE_SIZE], arms.r_min, arms.r_max)
-        project_epms(trial, arms.r_min, arms.r_max, arms.gap)
-        within_reach(arms, old, trial)
-        move(arms, old, trial, s.bases[stage : stage + 2], motion)
+            shift(trial[k], s.bases[stage + 1, k], step[at : at + POSE_SIZE], arms.limits.r_min, arms.limits.r_max)
+        allow(arms, old, trial)
+        move(arms, old, trial, s.bases[stage : stage + 2], motion, False)
         s.trial_states[stage + 1] = s.trial_states[stage]
         cost += roll(
             model, s.trial_states[stage + 1], pushing, motion, goal, stage, none, residuals, s.jacobians[stage]
@@ -289,10 +295,17 @@ def plan(
 
 @kernel
 def land(
-    model: Model, state: Floats, pushing: Floats, goal: Goal, arms: Arms, motion: Motion, before: Floats, command: Floats
+    model: Model,
+    state: Floats,
+    pushing: Floats,
+    goal: Goal,
+    arms: Arms,
+    motion: Motion,
+    before: Floats,
+    command: Floats,
 ) -> float:
     """Turn ``state`` (12,) into the one after a command's time; return the cost of the errors in it."""
     none, residuals, nothing = np.empty((STATE, 0)), np.empty(STATE * len(goal.marks)), np.empty((0, 0))
     bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
-    move(arms, before, command, bases, motion)
+    move(arms, before, command, bases, motion, False)
     return roll(model, state, pushing, motion, goal, 0, none, residuals, nothing)

@@ -40,20 +40,20 @@ EPMS = 66
 """First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
 
 
-ROUTE_SIZE = 35
+ROUTE_SIZE = 48
 """Fields of an EPM of finite speed, see ``travel``."""
 
 
 @law
 def carried_moment(n_epm: int) -> int:
-    """Return the field of the moment of EPMs of finite speed, A m^2."""
+    """Return the first field of the moments of EPMs of finite speed, A m^2."""
     return EPMS + EPM_SIZE * n_epm
 
 
 @law
 def route(n_epm: int, k: int) -> int:
     """Return the first field of the ``k``-th EPM's route."""
-    return carried_moment(n_epm) + 1 + ROUTE_SIZE * k
+    return carried_moment(n_epm) + n_epm + ROUTE_SIZE * k
 
 
 @law

@@ -161,10 +161,24 @@ class Plant:
     """Greatest speed of an EPM's centre, m/s; infinite together with the next, the EPMs jump (paper)."""
     epm_turn_radps: float = math.inf
     """Greatest angular speed of an EPM's moment, rad/s."""
+    epm_acceleration_mps2: float = math.inf
+    """Greatest change of an EPM's centre's speed along its way, m/s^2."""
+    epm_turn_acceleration_radps2: float = math.inf
+    """Greatest change of its moment's angular speed, rad/s^2."""
+    latency_s: float = 0.0
+    """From the instant at which the robots are measured until the command made of it acts on the EPMs, s."""
+    noise_position_m: float = 0.0
+    """Standard deviation of a measured position, per axis."""
+    noise_heading_rad: float = 0.0
+    """Standard deviation of a measured heading."""
+    mismatch: float = 0.0
+    """Every mass, drag and magnetic moment is drawn within this share of its nominal value, anew in each episode."""
     dry_friction_n: float = 0.0
     """Coulomb friction against a robot's translation, N."""
     dry_friction_nm: float = 0.0
     """Coulomb friction against its rotation, N m."""
+    disturbance_n: float = 0.0
+    """Amplitude of a slow force on each robot, per axis, N: sinusoids of 20 to 60 s, drawn anew in each episode."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
@@ -176,6 +190,14 @@ class Plant:
             fits = _is_number(value) and 0.0 < value <= most and other != math.inf
             must_be = f"a number above 0 and at most {most:g}, or infinite as the other limit of the EPMs' speed is"
             require(fits or value == other == math.inf, name, must_be, value)
+        for name in ("epm_acceleration_mps2", "epm_turn_acceleration_radps2"):
+            value = getattr(self, name)
+            require(value == math.inf or (_is_number(value) and value > 0.0), name, "a number above 0", value)
+        most = {"latency_s": 10.0, "noise_position_m": 1.0, "noise_heading_rad": math.pi, "mismatch": 0.9}
+        for name in (*most, "dry_friction_n", "dry_friction_nm", "disturbance_n"):
+            value, limit = getattr(self, name), most.get(name, math.inf)
+            must_be = "a finite number of at least 0" + ("" if limit == math.inf else f" and at most {limit:g}")
+            require(_is_number(value) and 0.0 <= value <= limit, name, must_be, value)
         require(
             self.workspace_radius_m > self.body.diameter_m,
             "workspace_radius_m",
@@ -188,6 +210,16 @@ class Plant:
         """Whether the EPMs are at once where they are commanded."""
         return self.epm_speed_mps == math.inf
 
+    @property
+    def is_rough(self) -> bool:
+        """Whether anything but magnets and viscous drag acts on the robots."""
+        return self.dry_friction_n > 0.0 or self.dry_friction_nm > 0.0 or self.disturbance_n > 0.0
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether measurements are inexact."""
+        return self.noise_position_m > 0.0 or self.noise_heading_rad > 0.0
+
 
 PLANTS: dict[str, Plant] = {
     "paper": Plant(),
@@ -196,10 +228,23 @@ PLANTS: dict[str, Plant] = {
     "high-drag": Plant(body=Body(drag_linear_nspm=0.4, drag_rotational_nmsprad=2e-4)),
     # Data sheets of the UR5e and UR10e: typical speed of the tool 1 m/s, wrists 180 degrees/s.
     "moving": Plant(epm_speed_mps=1.0, epm_turn_radps=math.pi),
+    "arm": Plant(
+        # As above. Accelerations: between the defaults of URScript's movel and movej (1.2 m/s^2, 1.4 rad/s^2) and the
+        # limits of a Franka arm without load (13 m/s^2, 25 rad/s^2): an EPM weighs 6 kg.
+        epm_speed_mps=1.0,
+        epm_turn_radps=math.pi,
+        epm_acceleration_mps2=5.0,
+        epm_turn_acceleration_radps2=10.0,
+        latency_s=0.1,  # 20 ms of localisation (Zeng, ICRA 2026), the rest computing and the arms' controllers
+        noise_position_m=1.3e-3,  # localisation of two capsules: 1.28 mm, 1.13 degrees (Zeng, ICRA 2026)
+        noise_heading_rad=math.radians(1.1),
+        mismatch=0.2,
+    ),
 }
 """The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation. ``low-drag``,
 ``high-drag``: the same at the ends of what robots' drag may be. ``moving``: as ``paper``, but the EPMs move there at
-finite speed, and act on the robots on the way."""
+finite speed, and act on the robots on the way. ``arm``: they do so with finite acceleration, commands act late,
+measurements are noisy, and the plant's parameters are not quite the nominal ones."""
 
 
 CONTROL_HZ_RANGE = (0.01, 1000.0)

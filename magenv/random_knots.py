@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.angles import arctan2, sincos, wrap
-from magenv.kernels import kernel, law
+from magenv.kernels import kernel
+from magenv.streams import Keys, normal, uniform
 
 Floats = NDArray[np.float64]
-Keys = NDArray[np.uint64]
 
 _AXES = 6  # x, y, heading of both robots
 RANDOM_SEPARATION_M = (0.025, 0.100)
@@ -19,27 +19,6 @@ RANDOM_SEPARATION_M = (0.025, 0.100)
 _RANDOM_RADIUS_M = 0.082
 _RANDOM_SPEED_MIN_MPS = 2e-4
 RANDOM_TURN_MAX_RADPS = 0.1
-_GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-
-
-@law
-def _uniform(stream: Keys, low: float, high: float) -> float:
-    """Return a number from [low, high) of the stream (1,): SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
-    stream[0] += _GOLDEN
-    z = stream[0]
-    z = (z ^ (z >> _S30)) * _MIX_1
-    z = (z ^ (z >> _S27)) * _MIX_2
-    z = z ^ (z >> _S31)
-    return low + (high - low) * (float(z >> _S11) * 2.0**-53)
-
-
-@law
-def _normal(stream: Keys, deviation: float) -> float:
-    """Return a normally distributed number of mean zero (Box and Muller, 1958)."""
-    radius = math.sqrt(-2.0 * math.log(1.0 - _uniform(stream, 0.0, 1.0)))
-    _, cosine = sincos(_uniform(stream, 0.0, 2.0 * math.pi))
-    return deviation * radius * cosine
 
 
 @kernel
@@ -52,14 +31,14 @@ def try_knots(stream: Keys, duration: float, turn_max: float, lanes: Floats, kno
     ``lanes`` (8, 33), scratch, has all knots side by side, in one array and filled without branches, so that loops over
     them are vectorised.
     """
-    a, b = _uniform(stream, *RANDOM_SEPARATION_M), _uniform(stream, *RANDOM_SEPARATION_M)
+    a, b = uniform(stream, *RANDOM_SEPARATION_M), uniform(stream, *RANDOM_SEPARATION_M)
     closest, wider = min(a, b), abs(a - b)
-    moment = _uniform(stream, -0.6, 0.6)
-    bend0, bend1, bend2 = _normal(stream, 0.010), _normal(stream, 0.010), _normal(stream, 0.006)
-    line0, line1, line2 = _normal(stream, 0.35), _normal(stream, 0.25), _normal(stream, 0.25)
-    line0 += -0.5 * math.pi if _uniform(stream, 0.0, 1.0) < 0.5 else 0.5 * math.pi
-    half_length = _uniform(stream, 0.030, 0.065)
-    turn_s, turn_c = sincos(_uniform(stream, -math.pi, math.pi))
+    moment = uniform(stream, -0.6, 0.6)
+    bend0, bend1, bend2 = normal(stream, 0.010), normal(stream, 0.010), normal(stream, 0.006)
+    line0, line1, line2 = normal(stream, 0.35), normal(stream, 0.25), normal(stream, 0.25)
+    line0 += -0.5 * math.pi if uniform(stream, 0.0, 1.0) < 0.5 else 0.5 * math.pi
+    half_length = uniform(stream, 0.030, 0.065)
+    turn_s, turn_c = sincos(uniform(stream, -math.pi, math.pi))
     speed_min = 0.5 * duration * _RANDOM_SPEED_MIN_MPS  # per unit of u
     forbidden, segments = 0, lanes.shape[1] - 1
     for k in range(segments + 1):

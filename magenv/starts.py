@@ -6,9 +6,13 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from magenv.allocation import allocate
 from magenv.kernels import kernel
+from magenv.params import System
+from magenv.poses import POSE_SIZE, home_pose, robots_frame, to_cartesian
 from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_of, trajectory_of
 from magenv.workers import Workers
+from magenv.wrench import WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -48,20 +52,47 @@ def place_rows(
                     before[i, robot, j] = measured[i, robot, j]
 
 
+_PLANAR = (1, 2, 3, 6, 7, 8)
+
+
+def holding_epms(reference: Floats, system: System) -> Floats:
+    """Return EPMs (N, 6) that hold nominal robots at rest at a reference (2, 3), as near home as the solver finds them.
+
+    Where commands act late the robots would be gone before the first one, if the EPMs stood at home.
+    """
+    positions = np.zeros((2, 3))
+    positions[:, :2] = reference[:, :2]
+    home = home_pose(system.n_epm).reshape(-1, POSE_SIZE)
+    home[:, [0, 3]] += robots_frame(reference[0, 2], reference[1, 2])
+    held = allocate(
+        np.zeros(WRENCH_SIZE),
+        positions,
+        planar_moments(reference[:, 2], system.ipm_moment_am2),
+        system,
+        seed=0,
+        initial=home.reshape(-1),
+        stop_early=True,
+        components=_PLANAR,
+    )
+    return np.concatenate(to_cartesian(held.pose), axis=-1)
+
+
 class Starts:
     """The beginnings of ``n`` rows' episodes, one after another along each row's generator.
 
     They are drawn many at a time, since a call of a generator costs as much as its numbers.
     """
 
-    def __init__(self, n: int, random: bool, workers: Workers) -> None:
+    def __init__(self, n: int, random: bool, uncertain: bool, workers: Workers) -> None:
         self._random = random
+        self._uncertain = uncertain
         self._workers = workers
         self._rngs: list[np.random.Generator | None] = [None] * n
         self.used: NDArray[np.int64] = np.full(n, _AHEAD)
         self.offsets: Floats = np.zeros((n, _AHEAD, 6))
         self._sure = 0  # so many starts are drawn in every row
         self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if random else 0), np.uint64)
+        self.plant_keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if uncertain else 0), np.uint64)
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Draw the episodes of ``row`` from ``rng`` from now on."""
@@ -76,6 +107,8 @@ class Starts:
         if self._random:
             self._keys[row] = draw_keys(rng, _AHEAD)
         rng.standard_normal(out=self.offsets[row])
+        if self._uncertain:  # after all else, so that a plant's kind changes neither trajectory nor start
+            self.plant_keys[row] = draw_keys(rng, _AHEAD)
         self.used[row] = 0
 
     def draw(self, mask: Bools, coefficients: Floats, duration: Floats) -> None:

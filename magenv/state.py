@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel
+from magenv.streams import Keys
 from magenv.travel import Motion
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,7 @@ class State(NamedTuple):
     mass: Floats
     """(n, 2) kg"""
     epm_moment: Floats
-    """(n,) A m^2"""
+    """(n, N) A m^2"""
     coefficients: Floats
     """(n or 1, 32, 2, 3, 4)"""
     duration: Floats
@@ -53,6 +54,24 @@ class State(NamedTuple):
     diameter: float
     wall_radius: float
     motion: Motion
+    routes: Floats
+    """See ``hold.hold_rows``, as the next three."""
+    queue: Floats
+    slow: Floats
+    rubs: tuple[float, float, float]
+    uncertain: bool
+    """Whether anything of the plant is drawn; see ``uncertainty``, as for the next ten."""
+    plant_keys: Keys
+    plant_key: Keys
+    mismatch: float
+    nominal: tuple[float, ...]
+    inertia: Floats
+    drag_linear: Floats
+    drag_rotational: Floats
+    ipm_moments: Floats
+    substep: float
+    noise_position: float
+    noise_heading: float
 
     targets: Floats
     """(n, N, 6) commanded EPMs."""
@@ -78,6 +97,8 @@ class State(NamedTuple):
     """(n,) so many of them are used."""
     position_sd: float
     heading_sd: float
+    held_epms: Floats
+    """(n, 1 or 0, N, 6) where they start instead of at home: each row's, all rows', or no such thing."""
     home_epms: Floats
     """(N, 6) in the robots' frame."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, pose_rows, step_rows, wrench_rows
+from magenv.dynamics import Physics
 from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel, typed
@@ -20,6 +21,7 @@ from magenv.starts import place_rows
 from magenv.state import State
 from magenv.task import observe_rows, reward_terms
 from magenv.trajectories import trajectory_of
+from magenv.uncertainty import add_noise, draw_plants
 from magenv.world import begin_rows, describe_rows, time_of
 
 Floats = NDArray[np.float64]
@@ -115,6 +117,30 @@ def tell_rows(first: int, last: int, mask: Bools, s: State, observations: Observ
 @kernel
 def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: Observations) -> None:
     """Begin episodes where ``mask`` says, by their next offsets, EPMs at home; then tell of these rows."""
+    if s.uncertain:
+        draw_plants(
+            first,
+            last,
+            mask,
+            s.plant_keys,
+            s.used,
+            s.mismatch,
+            s.nominal,
+            s.substep,
+            Physics(
+                s.mass,
+                s.inertia,
+                s.drag_linear,
+                s.drag_rotational,
+                s.ipm_moments,
+                s.epm_moment,
+                s.diameter,
+                s.wall_radius,
+            ),
+            s.plant_key,
+            s.slow,
+            s.constants,
+        )
     place_rows(
         first,
         last,
@@ -130,12 +156,30 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
         s.before,
     )
     start_rows(first, last, mask, s.measured, s.home_epms, s.epms)
+    if len(s.held_epms) > 0:
+        epms, held = s.epms, s.held_epms
+        for i in range(first, last):
+            if mask[i]:
+                epms[i] = held[min(i, len(held) - 1)]
     begin_rows(
-        first, last, mask, s.robots, s.coefficients, s.duration, s.tracking_distance, s.step, s.numbers, s.counts
+        first,
+        last,
+        mask,
+        s.robots,
+        s.coefficients,
+        s.duration,
+        s.tracking_distance,
+        s.routes,
+        s.step,
+        s.numbers,
+        s.counts,
     )
-    projected = s.projected
+    projected, measured, before, stream = s.projected, s.measured, s.before, np.empty(1, np.uint64)
     for i in range(first, last):
         projected[i] &= not mask[i]
+        if mask[i] and s.uncertain:
+            add_noise(measured, i, s.plant_key[i], 0, s.noise_position, s.noise_heading, stream)
+            before[i] = measured[i]
     tell_rows(first, last, mask, s, observations)
 
 
@@ -150,6 +194,7 @@ def _settle_rows(first: int, last: int, active: Bools, s: State) -> None:
     """Measure the robots after a hold; write what it paid and how it ended. Inactive rows: nothing, not ended."""
     robots, measured, before, numbers, counts = s.robots, s.measured, s.before, s.numbers, s.counts
     paid, ended, step, duration = s.paid, s.ended, s.step, s.duration
+    stream = np.empty(1, np.uint64)
     for i in range(first, last):
         paid[2, i], ended[0, i], ended[1, i] = 0.0, False, False
         if active[i]:
@@ -157,6 +202,8 @@ def _settle_rows(first: int, last: int, active: Bools, s: State) -> None:
                 for j in range(3):
                     before[i, robot, j] = measured[i, robot, j]
                     measured[i, robot, j] = robots[i, robot, j]
+            if s.uncertain:
+                add_noise(measured, i, s.plant_key[i], step[i], s.noise_position, s.noise_heading, stream)
             paid[0, i], paid[1, i] = reward_terms(numbers[0, i], numbers[1, i])
             paid[2, i] = 0.5 * (paid[0, i] + paid[1, i])
             ended[0, i] = counts[1, i] > 0
@@ -175,6 +222,7 @@ def _hold(
     magnets: tuple[int, ...],
     side_by_side: tuple[int, ...],
     moving: tuple[int, ...],
+    rubbing: tuple[int, ...],
 ) -> None:
     """Hold the commanded EPMs for one control period; what that paid, and what is told of all rows."""
     hold_rows(
@@ -199,22 +247,27 @@ def _hold(
         s.diameter,
         s.wall_radius,
         s.motion,
+        s.routes,
+        s.queue,
+        s.slow,
+        s.rubs,
         magnets,
         side_by_side,
         moving,
+        rubbing,
     )
     _settle_rows(first, last, active, s)
     tell_rows(first, last, s.every, s, observations)
 
 
 @functools.cache
-def step_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Step:
+def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool) -> Step:
     """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
 
-    Mode, number of EPMs and of lanes, and whether the EPMs travel, are constants of the machine code: of the branches
+    Mode, number of EPMs and of lanes, how commands act and whether the plant is rough are constants of the machine code: of the branches
     one is compiled.
     """
-    shape = hold_shape(n_epm, width, travels)
+    shape = hold_shape(n_epm, width, moves, rough)
 
     def step_episodes(
         first: int, last: int, active: Bools, actions: Floats, s: State, observations: Observations
@@ -233,9 +286,11 @@ def step_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Step
 
 
 @functools.cache
-def one_kernel(mode: ActionMode, n_epm: int, width: int, travels: bool) -> Callable[[State], tuple[object, ...]]:
+def one_kernel(
+    mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool
+) -> Callable[[State], tuple[object, ...]]:
     """Return the kernel that steps the only episode by ``action``, clipped; one that is not finite moves nothing."""
-    shape = hold_shape(n_epm, width, travels)
+    shape = hold_shape(n_epm, width, moves, rough)
 
     def step_one(s: State) -> tuple[object, ...]:
         fit = clip(s.action[0])

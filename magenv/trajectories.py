@@ -16,10 +16,10 @@ from magenv.arithmetic import fma
 from magenv.kernels import kernel, law
 from magenv.params import require
 from magenv.random_knots import RANDOM_TURN_MAX_RADPS, try_knots
+from magenv.streams import Keys
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Keys = NDArray[np.uint64]
 
 SEGMENTS = 32
 """Spline segments of every trajectory."""

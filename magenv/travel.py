@@ -1,10 +1,11 @@
-"""EPMs that move at finite speed: how they go on from where they are to where they are commanded.
+"""EPMs that move at finite speed and acceleration: how they go on from where they are to where they are commanded.
 
 An EPM's centre goes round the workspace centre on the great circle to its goal while its radius changes in step, so
-that it comes no nearer than the nearer end; its moment turns the shortest way. Each command is a move of its own, gone
-evenly: angle and radius grow by the same at every substep, and the centre has its full speed where its radius is
-largest. What the EPMs do to the robots in a substep is what they do halfway. Where two centres would come closer than
-the least gap, they go slower, are moved apart as commands are, and step aside, always to the same side.
+that it comes no nearer than the nearer end; its moment turns the shortest way. A move begins and ends at rest: speed
+rises evenly, stays, and falls evenly; the centre has its full speed where its radius is largest. A command that comes
+during a move lets the EPM brake on its way, then set off anew. What the EPMs do to the robots in a substep is what they
+do halfway. Where two centres would come closer than the least gap they brake, creep, are moved apart as commands are,
+and step aside, always to the same side.
 """
 
 from __future__ import annotations
@@ -19,21 +20,33 @@ from magenv.angles import arctan2, sincos
 from magenv.arithmetic import cross2, dot2, dot3
 from magenv.dynamics import place_epm
 from magenv.kernels import kernel, law
-from magenv.lanes import carried_moment, route
+from magenv.lanes import ROUTE_SIZE, carried_moment, route
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, project_epms
 
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-_CENTRE, _MOMENT, _GOAL, _GOAL_MOMENT, _NEXT, _RADIUS, _GROWTH, _WAY, _TURN = 0, 3, 6, 9, 12, 15, 16, 17, 26
-"""Within an EPM's fields: its centre (m) and unit moment, those commanded, its centre at the substep's end; its radius
-and what that grows by in a substep (m); the way of its direction from the workspace centre, and that of its moment."""
-_ALONG, _ACROSS, _SINE, _COSINE, _LEFT = 0, 3, 6, 7, 8
-"""Within a way, which is nine fields: the unit vector that turns, the one at right angles to it towards the goal; of
-the angle by which both turn in a substep; the substeps left, a fraction at the end."""
-_ALMOST = 1.0 + 1e-9
-"""Substeps that count as one: more than rounding can be."""
+_CENTRE, _MOMENT, _GOAL, _GOAL_MOMENT, _NEXT, _RADIUS, _GROWTH, _BEND, _WAY, _TURN = 0, 3, 6, 9, 12, 15, 16, 17, 18, 33
+"""Within an EPM's fields: its centre (m) and unit moment, those commanded, its centre at the substep's end; its radius,
+what that grows by in a substep, and by what this changes while the speed does (m); the way of its direction from the
+workspace centre, and that of its moment."""
+_ALONG, _ACROSS, _SINE, _COSINE, _BEND_SINE, _BEND_COSINE, _UP, _FLAT, _DOWN, _NEW, _WHOLE = (
+    0,
+    3,
+    6,
+    7,
+    8,
+    9,
+    10,
+    11,
+    12,
+    13,
+    14,
+)
+"""Within a way, which is fifteen fields: the unit vector that turns, the one at right angles to it towards the goal; of
+the angle by which both turn in a substep, and of that by which it changes; substeps left of rising, constant and
+falling speed; one where a goal waits to be set off for; one where the way ends at its goal."""
 _OPPOSITE = 1e-6
 """Sine below which two directions count as opposite: any way round is the shortest."""
 _UPRIGHT = 0.9999
@@ -55,12 +68,26 @@ class Motion(NamedTuple):
     """m."""
     gap: float
     """m."""
+    rise: float
+    """Share of ``reach`` by which a centre's speed changes at most."""
+    turn_rise: float
+    """Share of ``turn`` by which a moment's does."""
+    lag: int
+    """Substeps of a hold after which a command acts,"""
+    wait: int
+    """so many holds after its own."""
 
     @classmethod
-    def of(cls, system: System, plant: Plant, substep_s: float) -> Motion:
+    def of(cls, system: System, plant: Plant, substep_s: float, substeps: int) -> Motion:
         """Return the limits of a substep; of no use, but of the same types, where the EPMs jump."""
         reach, turn = plant.epm_speed_mps * substep_s, plant.epm_turn_radps * substep_s
-        return cls(reach, turn, system.r_min_m, system.r_max_m, system.gap_min_m)
+        rise = plant.epm_acceleration_mps2 * substep_s / plant.epm_speed_mps if not plant.epms_jump else math.inf
+        turn_rise = (
+            plant.epm_turn_acceleration_radps2 * substep_s / plant.epm_turn_radps if not plant.epms_jump else math.inf
+        )
+        lag = round(plant.latency_s / substep_s)
+        limits = (system.r_min_m, system.r_max_m, system.gap_min_m)
+        return cls(reach, turn, *limits, rise, turn_rise, lag % substeps, lag // substeps)
 
 
 @law
@@ -91,7 +118,7 @@ def _cross(u: Vector, v: Vector) -> Vector:
 
 
 @law
-def _way_round(u: Vector, v: Vector) -> tuple[float, Vector]:
+def way_round(u: Vector, v: Vector) -> tuple[float, Vector]:
     """Return the angle (rad) from unit vector u to v, and the unit vector at right angles to u towards v.
 
     Where v is opposite, any: one that is horizontal, or in the plane of u and the x axis where u is upright.
@@ -103,31 +130,77 @@ def _way_round(u: Vector, v: Vector) -> tuple[float, Vector]:
     return arctan2(sine, cosine), _unit(*_cross(axis, u))
 
 
+@kernel
+def ramp(way: float, rise: float) -> tuple[int, int]:
+    """Return the substeps of rising and of constant speed of a move.
+
+    ``way`` is how many substeps at full speed would take, ``rise`` the share of full speed by which it changes in a
+    substep. Speed rises in ``up`` steps, stays for ``flat`` and falls in ``up`` - 1: in all up (up + flat) steps' worth.
+    """
+    if way * rise <= 1.0:  # full speed is not reached
+        return max(1, int(math.ceil(math.sqrt(way / rise)))), 0
+    up = max(1, int(math.ceil(1.0 / rise)))
+    return up, max(0, int(math.ceil(way - up)))
+
+
 @law
-def _set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: float, left: float) -> None:
-    """Write the way whose fields begin at ``w``: from unit vector u by ``angle`` (rad) in ``left`` substeps."""
+def _set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: float, up: int, flat: int) -> None:
+    """Write the way whose fields begin at ``w``: from unit vector u by ``angle`` (rad)."""
     _write(lanes, i, w + _ALONG, *u)
     _write(lanes, i, w + _ACROSS, *across)
-    lanes[w + _SINE, i], lanes[w + _COSINE, i] = sincos(angle / max(left, 1.0))
-    lanes[w + _LEFT, i] = left
+    lanes[w + _BEND_SINE, i], lanes[w + _BEND_COSINE, i] = sincos(angle / (up * (up + flat)))
+    lanes[w + _SINE, i], lanes[w + _COSINE, i] = 0.0, 1.0
+    lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _DOWN, i] = up, flat, up - 1
+    lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 0.0, 1.0
 
 
 @law
-def _go_way(lanes: Floats, i: int, w: int) -> tuple[Vector, bool]:
-    """Go a substep on the way whose fields begin at ``w``; return the unit vector, and whether it is at its end."""
+def _left(lanes: Floats, i: int, w: int) -> float:
+    """Return the substeps left of the way whose fields begin at ``w``."""
+    return lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i]
+
+
+@law
+def _stopping(lanes: Floats, i: int, w: int) -> float:
+    """Return the substeps that the way whose fields begin at ``w`` goes on for if it brakes from now on."""
+    return max(lanes[w + _DOWN, i] - lanes[w + _UP, i], 0.0)
+
+
+@law
+def _brake(lanes: Floats, i: int, w: int) -> None:
+    """Let the way whose fields begin at ``w`` come to rest; then its goal, perhaps a new one, is set off for."""
+    lanes[w + _DOWN, i] = _stopping(lanes, i, w)
+    lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 0.0, 0.0, 1.0, 0.0
+
+
+@law
+def _go_way(lanes: Floats, i: int, w: int) -> tuple[Vector, float, bool, bool]:
+    """Go a substep on the way whose fields begin at ``w``.
+
+    Returns the unit vector, by how many steps the speed has changed, whether it moves, and whether it is at its goal.
+    """
+    up, flat, down = lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _DOWN, i]
+    moves, there = up + flat + down > 0.0, (up + flat + down == 1.0) & (lanes[w + _WHOLE, i] > 0.0)
+    change = 1.0 if up > 0.0 else (0.0 if flat > 0.0 else -1.0)
+    bend_s = change * lanes[w + _BEND_SINE, i]
+    bend_c = lanes[w + _BEND_COSINE, i] if change != 0.0 else 1.0
     sine, cosine = lanes[w + _SINE, i], lanes[w + _COSINE, i]
+    sine, cosine = dot2(sine, cosine, bend_c, bend_s), dot2(cosine, -sine, bend_c, bend_s)
+    sine, cosine = (sine if moves else 0.0), (cosine if moves else 1.0)
+    lanes[w + _SINE, i], lanes[w + _COSINE, i] = sine, cosine
+    lanes[w + _UP, i] = max(up - 1.0, 0.0)
+    lanes[w + _FLAT, i] = flat - 1.0 if (up == 0.0) & (flat > 0.0) else flat
+    lanes[w + _DOWN, i] = down - 1.0 if (up + flat == 0.0) & (down > 0.0) else down
     ux, uy, uz = _read(lanes, i, w + _ALONG)
     tx, ty, tz = _read(lanes, i, w + _ACROSS)
     x, y, z = dot2(cosine, sine, ux, tx), dot2(cosine, sine, uy, ty), dot2(cosine, sine, uz, tz)
     _write(lanes, i, w + _ALONG, x, y, z)
     _write(lanes, i, w + _ACROSS, dot2(cosine, -sine, tx, ux), dot2(cosine, -sine, ty, uy), dot2(cosine, -sine, tz, uz))
-    there: bool = lanes[w + _LEFT, i] <= _ALMOST
-    lanes[w + _LEFT, i] -= 1.0
-    return (x, y, z), there
+    return (x, y, z), change, moves, there
 
 
 @kernel
-def _draw_way(lanes: Floats, i: int, e: int, at: int, reach: float) -> None:
+def _draw_way(lanes: Floats, i: int, e: int, at: int, reach: float, rise: float) -> None:
     """Draw the way of the centre at ``at`` of the EPM whose fields begin at ``e`` to its goal.
 
     No chord of a substep is longer than ``reach`` (m): none is longer than the arc at the largest radius.
@@ -136,40 +209,80 @@ def _draw_way(lanes: Floats, i: int, e: int, at: int, reach: float) -> None:
     gx, gy, gz = _read(lanes, i, e + _GOAL)
     radius, goal = _norm(x, y, z), _norm(gx, gy, gz)
     u = (x / radius, y / radius, z / radius)
-    angle, across = _way_round(u, (gx / goal, gy / goal, gz / goal))
+    angle, across = way_round(u, (gx / goal, gy / goal, gz / goal))
     arc, out = max(radius, goal) * angle, goal - radius
-    left = math.sqrt(dot2(arc, out, arc, out)) / reach
-    _set_way(lanes, i, e + _WAY, u, across, angle, left)
-    lanes[e + _RADIUS, i], lanes[e + _GROWTH, i] = radius, out / max(left, 1.0)
+    up, flat = ramp(math.sqrt(dot2(arc, out, arc, out)) / reach, rise)
+    _set_way(lanes, i, e + _WAY, u, across, angle, up, flat)
+    lanes[e + _RADIUS, i], lanes[e + _GROWTH, i], lanes[e + _BEND, i] = radius, 0.0, out / (up * (up + flat))
 
 
 @law
 def _go(lanes: Floats, i: int, e: int) -> None:
     """Write where the centre of the EPM whose fields begin at ``e`` goes, alone, in a substep."""
-    (x, y, z), there = _go_way(lanes, i, e + _WAY)
-    radius = lanes[e + _RADIUS, i] + lanes[e + _GROWTH, i]
-    lanes[e + _RADIUS, i] = radius
+    (x, y, z), change, moves, there = _go_way(lanes, i, e + _WAY)
+    growth = lanes[e + _GROWTH, i] + change * lanes[e + _BEND, i]
+    radius = lanes[e + _RADIUS, i] + growth
+    lanes[e + _GROWTH, i], lanes[e + _RADIUS, i] = growth, radius
     gx, gy, gz = _read(lanes, i, e + _GOAL)
+    cx, cy, cz = _read(lanes, i, e + _CENTRE)
     x, y, z = (gx if there else radius * x), (gy if there else radius * y), (gz if there else radius * z)
-    _write(lanes, i, e + _NEXT, x, y, z)
+    _write(lanes, i, e + _NEXT, x if moves else cx, y if moves else cy, z if moves else cz)
 
 
 @kernel
-def _draw_turn(lanes: Floats, i: int, e: int, turn: float) -> None:
+def _draw_turn(lanes: Floats, i: int, e: int, turn: float, rise: float) -> None:
     """Draw the way of the moment of the EPM whose fields begin at ``e`` to that commanded, ``turn`` (rad) a substep."""
     u = _read(lanes, i, e + _MOMENT)
-    angle, across = _way_round(u, _read(lanes, i, e + _GOAL_MOMENT))
-    _set_way(lanes, i, e + _TURN, u, across, angle, angle / turn)
+    angle, across = way_round(u, _read(lanes, i, e + _GOAL_MOMENT))
+    _set_way(lanes, i, e + _TURN, u, across, angle, *ramp(angle / turn, rise))
 
 
 @law
 def _turn(lanes: Floats, i: int, e: int) -> Vector:
     """Turn the moment of the EPM whose fields begin at ``e`` for a substep and return it."""
-    (x, y, z), there = _go_way(lanes, i, e + _TURN)
+    (x, y, z), _, moves, there = _go_way(lanes, i, e + _TURN)
     gx, gy, gz = _read(lanes, i, e + _GOAL_MOMENT)
+    mx, my, mz = _read(lanes, i, e + _MOMENT)
     x, y, z = (gx if there else x), (gy if there else y), (gz if there else z)
+    x, y, z = (x if moves else mx), (y if moves else my), (z if moves else mz)
     _write(lanes, i, e + _MOMENT, x, y, z)
     return x, y, z
+
+
+@law
+def is_due(lanes: Floats, i: int, n_epm: int) -> bool:
+    """Return whether an EPM of lane ``i`` is at rest and has a goal to set off for."""
+    due = False
+    for k in range(n_epm):
+        for w in (route(n_epm, k) + _WAY, route(n_epm, k) + _TURN):
+            due |= (lanes[w + _NEW, i] > 0.0) & (_left(lanes, i, w) == 0.0)
+    return due
+
+
+@kernel
+def set_off(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
+    """Draw the ways that are due in lane ``i``."""
+    for k in range(n_epm):
+        e = route(n_epm, k)
+        if lanes[e + _WAY + _NEW, i] > 0.0 and _left(lanes, i, e + _WAY) == 0.0:
+            _draw_way(lanes, i, e, e + _CENTRE, motion.reach, motion.rise)
+        if lanes[e + _TURN + _NEW, i] > 0.0 and _left(lanes, i, e + _TURN) == 0.0:
+            _draw_turn(lanes, i, e, motion.turn, motion.turn_rise)
+
+
+@kernel
+def command(lanes: Floats, i: int, targets: Floats) -> None:
+    """Give the EPMs of lane ``i`` goals (N, 6): where they are new they brake, then set off."""
+    n_epm = len(targets)
+    for k in range(n_epm):
+        e = route(n_epm, k)
+        for goal, w, first in ((e + _GOAL, e + _WAY, 0), (e + _GOAL_MOMENT, e + _TURN, 3)):
+            same = True
+            for axis in range(3):
+                same &= lanes[goal + axis, i] == targets[k, first + axis]
+                lanes[goal + axis, i] = targets[k, first + axis]
+            if not same:
+                _brake(lanes, i, w)
 
 
 @law
@@ -181,13 +294,20 @@ def _distance2(lanes: Floats, i: int, a: int, b: int) -> float:
 
 @law
 def go_on(lanes: Floats, i: int, n_epm: int, motion: Motion) -> bool:
-    """Find where the centres in lane ``i`` would go in a substep; return whether two of them would come too close."""
+    """Find where the centres in lane ``i`` would go in a substep; return whether two of them have to look out.
+
+    They have where they would come too close, or could if they braked from now on only.
+    """
     near, least = False, motion.gap - 2.0 * GAP_TOLERANCE_M  # goals are allowed within the tolerance
     for k in range(n_epm):
         _go(lanes, i, route(n_epm, k))
     for k in range(1, n_epm):
         for j in range(k):
-            near |= _distance2(lanes, i, route(n_epm, j) + _NEXT, route(n_epm, k) + _NEXT) < least * least
+            a, b = route(n_epm, j), route(n_epm, k)
+            now, then = _distance2(lanes, i, a, b), _distance2(lanes, i, a + _NEXT, b + _NEXT)
+            stopping = 0.5 * max(_stopping(lanes, i, a + _WAY), _stopping(lanes, i, b + _WAY))
+            closing = max(math.sqrt(now) - math.sqrt(then), 0.0)
+            near |= math.sqrt(then) - stopping * closing < least
     return near
 
 
@@ -205,29 +325,40 @@ def _step_aside(a: Floats, b: Floats, gap: float, way: float) -> None:
 
 @kernel
 def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
-    """Let centres of lane ``i`` that would come too close pass each other.
+    """Let centres of lane ``i`` that have to look out brake; at rest, let them pass each other.
 
-    They go half as far as they may and step aside, then are projected as commands are; where that would take one
-    farther than it may go, all wait for a substep. Their ways are drawn anew. Two always pass; of three or more, in one
-    command of some hundreds, some stand before each other until the next command.
+    Then they go half as far as they may from rest and step aside, and are projected as commands are; where that would
+    take one farther than it may go, all wait for a substep. Two always pass; of three or more, in one command of some
+    hundreds, some stand before each other until the next command. Where braking is too late, as ways are bent, all stop
+    at once: the gap goes before the acceleration.
     """
-    centres, waits = np.zeros((n_epm, EPM_SIZE)), False
+    least, slow, close = motion.gap - 2.0 * GAP_TOLERANCE_M, True, False
+    for k in range(n_epm):
+        slow &= _stopping(lanes, i, route(n_epm, k) + _WAY) == 0.0
+        for j in range(k):
+            close |= _distance2(lanes, i, route(n_epm, j) + _NEXT, route(n_epm, k) + _NEXT) < least * least
+    if not slow and not close:
+        for k in range(n_epm):
+            _brake(lanes, i, route(n_epm, k) + _WAY)
+        return
+    centres, waits, creep = np.zeros((n_epm, EPM_SIZE)), not slow, min(motion.rise, 1.0) * motion.reach
     for k in range(n_epm):
         e = route(n_epm, k)
         for axis in range(3):
             centres[k, axis] = 0.5 * (lanes[e + _CENTRE + axis, i] + lanes[e + _NEXT + axis, i])
     for k in range(1, n_epm):
         for j in range(k):
-            _step_aside(centres[j], centres[k], motion.gap, _ASIDE * motion.reach)
+            _step_aside(centres[j], centres[k], motion.gap, _ASIDE * creep)
     project_epms(centres, motion.r_min, motion.r_max, motion.gap)
     for k in range(n_epm):
         x, y, z = _read(lanes, i, route(n_epm, k) + _CENTRE)
-        waits |= not _norm(centres[k, 0] - x, centres[k, 1] - y, centres[k, 2] - z) <= motion.reach
+        waits |= not _norm(centres[k, 0] - x, centres[k, 1] - y, centres[k, 2] - z) <= creep
     for k in range(n_epm):
         e = route(n_epm, k)
         for axis in range(3):
             lanes[e + _NEXT + axis, i] = lanes[e + _CENTRE + axis, i] if waits else centres[k, axis]
-        _draw_way(lanes, i, e, e + _NEXT, motion.reach)
+        _brake(lanes, i, e + _WAY)
+        lanes[e + _WAY + _DOWN, i] = 0.0
 
 
 @law
@@ -242,27 +373,28 @@ def carry(lanes: Floats, i: int, n_epm: int) -> None:
         vx, vy, vz = _turn(lanes, i, e)
         x, y, z = 0.5 * (x + p), 0.5 * (y + q), 0.5 * (z + r)
         ux, uy, uz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)
-        place_epm(lanes, i, k, lanes[carried_moment(n_epm), i], x, y, z, ux, uy, uz)
+        place_epm(lanes, i, k, lanes[carried_moment(n_epm) + k, i], x, y, z, ux, uy, uz)
 
 
 @kernel
-def set_off(lanes: Floats, i: int, row: int, moment: float, epms: Floats, targets: Floats, motion: Motion) -> None:
-    """Put the EPMs (n, N, 6) of a row, their moment (A m^2) and their ways to the ``targets`` into lane ``i``."""
-    n_epm = epms.shape[1]
-    lanes[carried_moment(n_epm), i] = moment
+def take_up(lanes: Floats, i: int, moments: Floats, epms: Floats, routes: Floats) -> None:
+    """Put EPMs (N, 6), their moments (N,) in A m^2 and how they move (N, 48) into lane ``i``."""
+    n_epm = len(epms)
     for k in range(n_epm):
         e = route(n_epm, k)
+        lanes[carried_moment(n_epm) + k, i] = moments[k]
+        for j in range(ROUTE_SIZE):
+            lanes[e + j, i] = routes[k, j]
         for j in range(EPM_SIZE):
-            lanes[e + _CENTRE + j, i] = epms[row, k, j]
-            lanes[e + _GOAL + j, i] = targets[row, k, j]
-        _draw_way(lanes, i, e, e + _CENTRE, motion.reach)
-        _draw_turn(lanes, i, e, motion.turn)
+            lanes[e + _CENTRE + j, i] = epms[k, j]
 
 
 @law
-def arrive(lanes: Floats, i: int, row: int, epms: Floats) -> None:
-    """Write where the EPMs of lane ``i`` are into a row of ``epms`` (n, N, 6)."""
-    n_epm = epms.shape[1]
+def put_down(lanes: Floats, i: int, epms: Floats, routes: Floats) -> None:
+    """Write where the EPMs of lane ``i`` are (N, 6) and how they move (N, 48)."""
+    n_epm = len(epms)
     for k in range(n_epm):
         for j in range(EPM_SIZE):
-            epms[row, k, j] = lanes[route(n_epm, k) + j, i]
+            epms[k, j] = lanes[route(n_epm, k) + j, i]
+        for j in range(ROUTE_SIZE):
+            routes[k, j] = lanes[route(n_epm, k) + j, i]

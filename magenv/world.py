@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.dynamics import Physics, constants
-from magenv.hold import LOSSES, hold_kernel
+from magenv.hold import AT_ONCE, LATE, LOSSES, TRAVELLING, hold_kernel
 from magenv.kernels import kernel, law
-from magenv.lanes import CONSTANTS_SIZE
+from magenv.lanes import CONSTANTS_SIZE, ROUTE_SIZE
 from magenv.params import Plant, System, TaskParams
 from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
 from magenv.trajectories import SEGMENTS, Trajectory, reference_of, trajectory_of
@@ -90,6 +90,7 @@ def begin_rows(
     coefficients: Floats,
     duration: Floats,
     tracking_distance: float,
+    routes: Floats,
     step: Integers,
     numbers: Floats,
     counts: Integers,
@@ -100,6 +101,8 @@ def begin_rows(
         if mask[i]:
             step[i] = 0
             counts[1, i] = 0
+            if len(routes) > 0:
+                routes[i] = 0.0  # the EPMs are at rest
             which = trajectory_of(i, len(duration))
             reference_of(coefficients, which, duration[which], 0.0, reference, 0)
             (x1, y1), (x2, y2) = (robots[i, 0, 0], robots[i, 0, 1]), (robots[i, 1, 0], robots[i, 1, 1])
@@ -177,7 +180,9 @@ class World:
     constants : ndarray, shape (n, 10)
         Of a substep, see ``magenv.dynamics.constants``.
     shape : tuple
-        Number of EPMs, lanes of the hold, whether the EPMs travel.
+        Number of EPMs, lanes of the hold, how commands act, whether the plant is rough.
+    routes, queue, slow : ndarray
+        How the EPMs move, commands that do not act yet, what disturbs the robots: see ``hold.hold_rows``.
     motion : Motion
         Limits of the EPMs' motion.
     held : tuple
@@ -199,7 +204,8 @@ class World:
         self.substeps = max(1, math.ceil(task.period_s / plant.substep_s - 1e-9))
         self._tracking_distance = task.tracking_distance_m
         self._workers = workers or Workers()
-        self.shape = (system.n_epm, 1 if n <= _FEW else _WIDTH, not plant.epms_jump)
+        moves = TRAVELLING if not plant.epms_jump else LATE if plant.latency_s > 0.0 else AT_ONCE
+        self.shape = (system.n_epm, 1 if n <= _FEW else _WIDTH, moves, plant.is_rough)
         self._hold = hold_kernel(*self.shape)
         self.robots: Floats = np.zeros((n, 2, 6))
         self.epms: Floats = np.zeros((n, system.n_epm, 6))
@@ -210,7 +216,12 @@ class World:
             self.coefficients[0], self.duration_s[0] = trajectory.coefficients, trajectory.duration_s
         self.step_count: Integers = np.zeros(n, np.int64)
         self.measurements = Measurements(n)
-        self.motion = Motion.of(system, plant, task.period_s / self.substeps)
+        self.motion = Motion.of(system, plant, task.period_s / self.substeps, self.substeps)
+        travels = n if moves == TRAVELLING else 0
+        self.routes: Floats = np.zeros((travels, system.n_epm, ROUTE_SIZE))
+        late = n if moves != AT_ONCE else 0
+        self.queue: Floats = np.zeros((late, 1 + self.motion.wait, system.n_epm, EPM_SIZE))
+        self.slow: Floats = np.zeros((n if plant.is_rough else 0, 2, 3))
         self.constants: Floats = np.empty((n, CONSTANTS_SIZE))
         constants(self.physics, task.period_s / self.substeps, self.constants)
         self.held = (
@@ -229,6 +240,10 @@ class World:
             self.physics.body_diameter,
             self.physics.wall_radius,
             self.motion,
+            self.routes,
+            self.queue,
+            self.slow,
+            (plant.disturbance_n, plant.dry_friction_n, plant.dry_friction_nm),
         )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:
@@ -250,6 +265,7 @@ class World:
             self.coefficients,
             self.duration_s,
             self._tracking_distance,
+            self.routes,
             self.step_count,
             m.numbers,
             m.counts,

@@ -28,7 +28,7 @@ def one_lane(robots: Floats, epms: Floats, physics: Physics, h: float) -> Floats
     lane[:12, 0] = robots.T.reshape(-1)  # both robots' x, then both y, ...
     lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row
     for k, epm in enumerate(epms):
-        place_epm(lane, 0, k, physics.epm_moment[0], *epm)
+        place_epm(lane, 0, k, physics.epm_moment[0, k], *epm)
     return lane
 
 

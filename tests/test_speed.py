@@ -144,7 +144,7 @@ def compiled() -> Any:
     cached: Any = hold_rows
     world, idle = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams()), np.zeros(16, np.bool_)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
-    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(2, 16, False))
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(2, 16))
     return fresh
 
 
