@@ -91,8 +91,18 @@ class Planner:
     def _polish(self, problem: Problem, commands: Floats) -> float:
         """Improve commands (H, N, 6) in place; return their cost."""
         return plan(
-            self.model, problem.state, problem.pushing, problem.doubt, problem.goal, self._arms, self._motion,
-            problem.before, CONVERGED, ITERATIONS, self._scratch, commands,
+            self.model,
+            problem.state,
+            problem.pushing,
+            problem.doubt,
+            problem.goal,
+            self._arms,
+            self._motion,
+            problem.before,
+            CONVERGED,
+            ITERATIONS,
+            self._scratch,
+            commands,
         )[0]
 
     def _from_statics(self, problem: Problem, least: float, rng: np.random.Generator) -> tuple[float, Floats]:
@@ -108,7 +118,11 @@ class Planner:
             land(self.model, state, problem.pushing, goal, self._arms, self._motion, before, commands[-1])
             before = commands[-1]
             later = Problem(
-                state, problem.pushing, np.zeros((STATE, STATE)), goal._replace(references=goal.references[stage:]), before
+                state,
+                problem.pushing,
+                np.zeros((STATE, STATE)),
+                goal._replace(references=goal.references[stage:]),
+                before,
             )
             found = [self._held_on_the_way(later, rng) for _ in range(LATER_SEARCHES)]
             commands.append(min(found, key=lambda pair: pair[0])[1][0])
@@ -133,8 +147,17 @@ class Planner:
             way = np.concatenate([problem.state[:COORDINATES] + share * ahead, ahead / self._period_s])
             part = problem.goal._replace(marks=np.array([len(motion.which)]), references=way[None, None])
             cost, _ = plan(
-                self.model, problem.state, problem.pushing, problem.doubt if whole else none,
-                problem.goal if whole else part, self._arms, motion, problem.before, CONVERGED,
-                ITERATIONS if whole else SHORT_ITERATIONS, self._single, command,
+                self.model,
+                problem.state,
+                problem.pushing,
+                problem.doubt if whole else none,
+                problem.goal if whole else part,
+                self._arms,
+                motion,
+                problem.before,
+                CONVERGED,
+                ITERATIONS if whole else SHORT_ITERATIONS,
+                self._single,
+                command,
             )
         return cost, command

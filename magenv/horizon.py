@@ -106,7 +106,14 @@ def _change(
 
 @kernel
 def _linearise(
-    model: Model, pushing: Floats, goal: Goal, arms: Arms, motion: Motion, before: Floats, doubt: Floats, commands: Floats,
+    model: Model,
+    pushing: Floats,
+    goal: Goal,
+    arms: Arms,
+    motion: Motion,
+    before: Floats,
+    doubt: Floats,
+    commands: Floats,
     s: Scratch,
 ) -> tuple[float, float]:
     """Write states, residuals and derivatives of all commands' times; return the cost, and the scale of ``s.lean``."""
@@ -289,7 +296,14 @@ def plan(
 
 @kernel
 def land(
-    model: Model, state: Floats, pushing: Floats, goal: Goal, arms: Arms, motion: Motion, before: Floats, command: Floats
+    model: Model,
+    state: Floats,
+    pushing: Floats,
+    goal: Goal,
+    arms: Arms,
+    motion: Motion,
+    before: Floats,
+    command: Floats,
 ) -> float:
     """Turn ``state`` (12,) into the one after a command's time; return the cost of the errors in it."""
     none, residuals, nothing = np.empty((STATE, 0)), np.empty(STATE * len(goal.marks)), np.empty((0, 0))

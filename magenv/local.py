@@ -1,4 +1,4 @@
-"""Local coordinates of an EPM, five without a singularity: two turns of its centre's direction, radius, two of its moment."""
+"""Local coordinates of an EPM, five without a singularity: two turns of its centre, the radius, two of its moment."""
 
 from __future__ import annotations
 

@@ -34,7 +34,9 @@ class Noise(NamedTuple):
 
 
 @kernel
-def forecast(model: Model, motion: Motion, first: int, last: int, noise: Noise, known: Floats, covariance: Floats) -> None:
+def forecast(
+    model: Model, motion: Motion, first: int, last: int, noise: Noise, known: Floats, covariance: Floats
+) -> None:
     """Carry estimate (18,) and covariance (18, 18) over the substeps ``first`` to ``last`` of a motion, in place."""
     by, drive = np.zeros((STATE, KNOWN)), np.zeros((COORDINATES, KNOWN))
     for i in range(COORDINATES):

@@ -130,9 +130,7 @@ def differentiate(model: Model, epms: Floats, by_epms: bool) -> None:
         model.positions[robot, 0] = lane[at, 0] + half * lane[at + 6, 0]
         model.positions[robot, 1] = lane[at + 2, 0] + half * lane[at + 8, 0]
         model.moments[robot, 0], model.moments[robot, 1] = moment * math.cos(heading), moment * math.sin(heading)
-    planar_kernel(
-        model.positions, model.moments, epms, model.epm_moment, by_epms, model.stiffness, model.gradients
-    )
+    planar_kernel(model.positions, model.moments, epms, model.epm_moment, by_epms, model.stiffness, model.gradients)
 
 
 @kernel
