@@ -80,7 +80,10 @@ def risk(
     cost, first = 0.0, jacobian.shape[1] - width
     for i in range(STATE):
         last, at = rows - STATE + i, rows + i
-        residuals[at] = (errors[last] - residuals[last]) / scale
+        grown, turn = errors[last] - residuals[last], 2.0 * math.pi * goal.weights[i]
+        if (i == 2 or i == 5) and abs(grown) > 0.5 * turn:  # one of the two errors was wrapped
+            grown -= math.copysign(turn, grown)
+        residuals[at] = grown / scale
         cost += residuals[at] * residuals[at]
         for c in range(width):
             jacobian[at, first + c] = (by[last, c] - jacobian[last, first + c]) / scale
