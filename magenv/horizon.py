@@ -136,6 +136,7 @@ def _linearise(
         at = STATE * len(goal.marks)
         if stage == 0:
             scale = lean_on(s.by[0, :, u : u + STATE], goal.weights, doubt, s.lean)
+            residuals[at : at + STATE], jacobian[at : at + STATE] = 0.0, 0.0
             if scale > 0.0:
                 cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, jacobian, True)
         cost += _change(commands[stage], old, s.bases[stage : stage + 2], goal.wander, residuals, jacobian, at + STATE)
@@ -275,7 +276,9 @@ def plan(
     s.states[0] = state
     for iteration in range(iterations):
         cost, scale = _linearise(model, pushing, goal, arms, motion, before, doubt, commands, s)
-        if not cost > enough:
+        if not cost < math.inf:  # NaN as well: from there nothing can be foreseen
+            return math.inf, iteration
+        if cost <= enough:
             return cost, iteration
         new = math.inf
         for _ in range(_TRIALS):

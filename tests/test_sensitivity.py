@@ -125,11 +125,11 @@ def test_errors_are_weighted_and_headings_wrapped(rng: np.random.Generator) -> N
     turns[[2, 5]] = [2 * np.pi, -4 * np.pi]
     end = end_of(model, state, UNMOVED, held(epms, SUBSTEPS))
     _, errors, jacobian = foreseen(
-        model, state, UNMOVED, held(epms, SUBSTEPS), goal_of(end[None], (SUBSTEPS,)), np.eye(STATE)
+        model, state, UNMOVED, held(epms, SUBSTEPS), goal_of(end[None], (SUBSTEPS,)), np.eye(STATE, 22)
     )
     np.testing.assert_array_equal(errors, np.zeros(STATE))
     goal = goal_of((end + turns + 0.1)[None], (SUBSTEPS,), weights)
-    _, errors, by = foreseen(model, state, UNMOVED, held(epms, SUBSTEPS), goal, np.eye(STATE))
+    _, errors, by = foreseen(model, state, UNMOVED, held(epms, SUBSTEPS), goal, np.eye(STATE, 22))
     np.testing.assert_allclose(errors, -0.1 * weights, rtol=1e-12)
     np.testing.assert_allclose(by, weights[:, None] * jacobian, rtol=1e-14)
 
