@@ -18,7 +18,7 @@ from magenv.poses import project_epms
 
 @pytest.mark.parametrize(("n_epm", "seed"), [(2, 0), (2, 2), (2, 5), (2, 7), (3, 0), (3, 5), (3, 7), (3, 8)])
 def test_a_plan_of_one_command_is_scipys(n_epm: int, seed: int) -> None:
-    """From the same start, within 1 % of the least cost, a thousandth of the first; from its end SciPy goes no lower."""
+    """Within 1 % of the least cost from the same start; and from where it ends SciPy goes no lower."""
     task = Task.draw(seed, n_epm)
     commands = task.start()
     first, cost = task.cost(commands), task.plan(commands)
@@ -30,7 +30,7 @@ def test_a_plan_of_one_command_is_scipys(n_epm: int, seed: int) -> None:
 
 @pytest.mark.parametrize(("n_epm", "seed"), [(2, 1), (2, 4), (3, 12)])
 def test_where_the_last_steps_are_slow_little_is_left(n_epm: int, seed: int) -> None:
-    """A plan ends where an iteration takes off less than a hundredth. SciPy goes on: by 0.2 % of the whole way at most."""
+    """A plan ends where an iteration takes off less than a hundredth; what SciPy still finds is 0.2 % of the way."""
     task = Task.draw(seed, n_epm)
     commands = task.start()
     first, cost = task.cost(commands), task.plan(commands)
