@@ -17,7 +17,7 @@ from magenv.allocation import allocate
 from magenv.forecast import STATE, Goal, Motion
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms
-from magenv.params import Plant, System
+from magenv.params import InputError, Plant, System
 from magenv.poses import to_cartesian
 from magenv.sensitivity import COORDINATES, Model
 from magenv.wrench import WRENCH_SIZE, planar_moments
@@ -138,7 +138,10 @@ class Planner:
         planar_target(drag * ahead / self._period_s - problem.pushing, halfway[2], halfway[5], target)
         positions[:, :2] = halfway.reshape(2, 3)[:, :2]
         moments = planar_moments(halfway[2::3], self._system.ipm_moment_am2)
-        held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+        try:
+            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+        except InputError:  # robots on the same spot, or a state that is not finite
+            return math.inf, problem.before[None]
         command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
         none, cost = np.zeros((STATE, STATE)), math.inf
         for motion in (*self._parts, self._motion):
