@@ -224,7 +224,7 @@ def _forward(
         away[u:] = s.trial_states[stage] - s.states[stage]
         if stage > 0:
             for k in range(n_epm):
-                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], away[POSE_SIZE * k : POSE_SIZE * k + 5])
+                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], away[POSE_SIZE * k : POSE_SIZE * (k + 1)])
         for i in range(u):
             total = s.gains[stage, i, STATE + u]
             for c in range(STATE + u):
@@ -270,7 +270,8 @@ def plan(
     """Improve the commands (H, N, 6) in place; return their cost and the iterations taken.
 
     The first acts from ``state`` (12,), with ``pushing`` (6,) throughout, after the EPMs stood at ``before`` (N, 6).
-    ``doubt`` (12, 12) is a root of the state's covariance, weighted; zero for none. Ends at a cost of ``enough``.
+    ``doubt`` (12, 12) is a root of the state's covariance, in the state's units; zero for none. Ends at a cost of
+    ``enough``. Where nothing can be foreseen the cost is infinite, and the commands stay as they are.
     """
     s, damping, cost = scratch, _DAMPING, math.inf
     s.states[0] = state
@@ -308,7 +309,10 @@ def land(
     before: Floats,
     command: Floats,
 ) -> float:
-    """Turn ``state`` (12,) into the one after a command's time; return the cost of the errors in it."""
+    """Turn ``state`` (12,) into the one after the time of a command (N, 6); return the cost of the errors in it.
+
+    ``pushing`` (6,) acts throughout, N and N m; the EPMs stood at ``before`` (N, 6).
+    """
     none, residuals, nothing = np.empty((STATE, 0)), np.empty(STATE * len(goal.marks)), np.empty((0, 0))
     bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
     move(arms, before, command, bases, motion)
