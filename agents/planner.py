@@ -79,6 +79,8 @@ class Planner:
         ``last`` (H, N, 6) is where to begin. The cost is infinite where nothing was found.
         """
         best, sought = last.copy(), False
+        if not np.isfinite([*problem.state, *problem.pushing]).all():
+            return best, math.inf, sought
         cost = self._polish(problem, best)
         turn, enough = 0, ENOUGH * self._stages
         while not cost < enough and turn < (SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES):
