@@ -17,7 +17,7 @@ from magenv.allocation import allocate
 from magenv.forecast import STATE, Goal, Motion
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms, move
-from magenv.params import Plant, System
+from magenv.params import InputError, Plant, System
 from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
 from magenv.sensitivity import COORDINATES, Model
 from magenv.travel import Motion as Limits
@@ -80,6 +80,8 @@ class Planner:
         ``last`` (H, N, 6) is where to begin. The cost is infinite where nothing was found.
         """
         best, sought = last.copy(), False
+        if not np.isfinite([*problem.state, *problem.pushing]).all():
+            return best, math.inf, sought
         cost = self._polish(problem, best)
         turn, enough = 0, ENOUGH * self._stages
         # EPMs that travel come only where the last plan, too, can be bent to
@@ -148,7 +150,10 @@ class Planner:
         planar_target(drag * ahead / self._period_s - problem.pushing, halfway[2], halfway[5], target)
         positions[:, :2] = halfway.reshape(2, 3)[:, :2]
         moments = planar_moments(halfway[2::3], self._system.ipm_moment_am2)
-        held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+        try:
+            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+        except InputError:  # robots on the same spot, or a state that is not finite
+            return math.inf, problem.before[None]
         command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
         none, cost = np.zeros((STATE, STATE)), math.inf
         for motion in (*self._parts, self._motion):

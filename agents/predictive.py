@@ -26,13 +26,13 @@ Floats = NDArray[np.float64]
 HORIZON_S = 0.2
 """Commands are planned for so long a time, one at least."""
 POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
-"""Errors that count one, and the time in which an error of the rate would make them: the robots' drag forgets faster."""
+"""Errors that count one, and the time in which an error of the rate would make them."""
 # What finite numbers and the neglected curvature of the motion leave in doubt, however exact the plant is.
 _FLOOR_M, _FLOOR_RAD, _FLOOR_MPS, _FLOOR_RADPS = 3e-6, 3e-6, 1e-5, 3e-5
 _PUSH_N, _PUSH_NM = 3e-5, 3e-8
 
 _DRIFT_N, _DRIFT_NM = 1e-2, 1e-4
-"""By what a push drifts in a second, per mismatch of the parameters: the EPMs move, and so does what is wrong of them."""
+"""By what a push drifts in a second, per mismatch of the parameters: the EPMs move, and with them what is amiss."""
 _AMISS_N, _AMISS_NM = 2e-2, 3e-4
 """Push at the beginning, per mismatch."""
 WANDER = 0.0
@@ -200,7 +200,7 @@ class Predictive:
             self._follow(paths, 0, self._lag, known, covariance)
         elif self._plant.epms_jump:
             before = epms
-        doubt = np.linalg.cholesky(covariance[:STATE, :STATE] + np.diag(self._floor**2))
+        doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
         problem = Problem(known[:STATE].copy(), known[STATE:].copy(), doubt, goal, before)
         memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)
         if not math.isfinite(cost):
@@ -211,6 +211,13 @@ class Predictive:
 
 _START_MPS, _START_RADPS = 1e-3, 1e-3
 """Rates that an episode may begin with."""
+
+
+def _root(covariance: Floats) -> Floats:
+    """Return a root L of a covariance, L L^T; rounding may have left it not quite positive."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
 def _noise(plant: Plant) -> Noise:

@@ -82,8 +82,9 @@ def roll(
 ) -> float:
     """Predict the motion of a command's time from ``state`` (12,), which is overwritten; return the errors' cost.
 
+    A wrench ``pushing`` (6,), N and N m, acts throughout; ``stage`` tells which of the goal's references count.
     Writes the weighted errors (12 k, at least) and, where ``sensitivity`` (12, m) has columns, their derivatives into
-    the last m columns of ``jacobian``. Its last columns are those of the command; before them, where there is room,
+    the last m columns of ``jacobian``. Its last 5 N columns are those of the command; before them, where there is room,
     those of the first state and of the command before. What it holds at first is carried on.
     """
     mark, last, cost, m = 0, -1, 0.0, sensitivity.shape[1]

@@ -136,6 +136,7 @@ def _linearise(
         at = STATE * len(goal.marks)
         if stage == 0:
             scale = lean_on(s.by[0, :, u : u + STATE], goal.weights, doubt, s.lean)
+            residuals[at : at + STATE], jacobian[at : at + STATE] = 0.0, 0.0
             if scale > 0.0:
                 cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, jacobian, True)
         cost += _change(commands[stage], old, s.bases[stage : stage + 2], goal.wander, residuals, jacobian, at + STATE)
@@ -223,7 +224,7 @@ def _forward(
         away[u:] = s.trial_states[stage] - s.states[stage]
         if stage > 0:
             for k in range(n_epm):
-                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], away[POSE_SIZE * k : POSE_SIZE * k + 5])
+                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], away[POSE_SIZE * k : POSE_SIZE * (k + 1)])
         for i in range(u):
             total = s.gains[stage, i, STATE + u]
             for c in range(STATE + u):
@@ -268,13 +269,16 @@ def plan(
     """Improve the commands (H, N, 6) in place; return their cost and the iterations taken.
 
     The first acts from ``state`` (12,), with ``pushing`` (6,) throughout, after the EPMs stood at ``before`` (N, 6).
-    ``doubt`` (12, 12) is a root of the state's covariance, weighted; zero for none. Ends at a cost of ``enough``.
+    ``doubt`` (12, 12) is a root of the state's covariance, in the state's units; zero for none. Ends at a cost of
+    ``enough``. Where nothing can be foreseen the cost is infinite, and the commands stay as they are.
     """
     s, damping, cost = scratch, _DAMPING, math.inf
     s.states[0] = state
     for iteration in range(iterations):
         cost, scale = _linearise(model, pushing, goal, arms, motion, before, doubt, commands, s)
-        if not cost > enough:
+        if not cost < math.inf:  # NaN as well: from there nothing can be foreseen
+            return math.inf, iteration
+        if cost <= enough:
             return cost, iteration
         new = math.inf
         for _ in range(_TRIALS):
@@ -304,7 +308,10 @@ def land(
     before: Floats,
     command: Floats,
 ) -> float:
-    """Turn ``state`` (12,) into the one after a command's time; return the cost of the errors in it."""
+    """Turn ``state`` (12,) into the one after the time of a command (N, 6); return the cost of the errors in it.
+
+    ``pushing`` (6,) acts throughout, N and N m; the EPMs stood at ``before`` (N, 6).
+    """
     none, residuals, nothing = np.empty((STATE, 0)), np.empty(STATE * len(goal.marks)), np.empty((0, 0))
     bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
     move(arms, before, command, bases, motion, False)

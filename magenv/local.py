@@ -1,4 +1,4 @@
-"""Local coordinates of an EPM, five without a singularity: two turns of its centre's direction, radius, two of its moment."""
+"""Local coordinates of an EPM, five without a singularity: two turns of its centre, the radius, two of its moment."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def local_basis(epm: Floats, basis: Floats) -> None:
 
 @kernel
 def shift(epm: Floats, basis: Floats, step: Floats, r_min: float, r_max: float) -> None:
-    """Move an EPM (6,) by a step (5,) in its local coordinates, its radius within the bounds."""
+    """Move an EPM (6,) by a step (5,) in its local coordinates, of basis (6, 5), its radius within the bounds (m)."""
     radius = math.sqrt(dot3(epm[0], epm[1], epm[2], epm[0], epm[1], epm[2]))
     out = min(max(radius + step[2], r_min), r_max)
     for at, column, length in ((0, 0, out), (3, 3, 1.0)):
@@ -46,7 +46,7 @@ def shift(epm: Floats, basis: Floats, step: Floats, r_min: float, r_max: float) 
 
 @kernel
 def seen_from(epm: Floats, other: Floats, basis: Floats, out: Floats) -> None:
-    """Write the local coordinates (5,) of an EPM near another one, whose basis (6, 5) has columns at right angles."""
+    """Write the local coordinates (5,) of an EPM (6,) near another, whose basis (6, 5) has columns at right angles."""
     for c in range(POSE_SIZE):
         along, square = 0.0, 0.0
         for a in range(EPM_SIZE):

@@ -46,7 +46,7 @@ def _share(j: int, up: int, flat: int) -> float:
 @kernel
 def _longest(rise: float, substeps: int) -> float:
     """Return the longest way, in substeps at full speed, that is gone in so many."""
-    full = max(1, int(math.ceil(1.0 / rise)))
+    full = max(1, math.ceil(1.0 / rise))
     if substeps >= 2 * full - 1:
         return 1.0 * (substeps - full + 1)
     up = (substeps + 1) // 2

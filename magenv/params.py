@@ -193,9 +193,9 @@ class Plant:
         for name in ("epm_acceleration_mps2", "epm_turn_acceleration_radps2"):
             value = getattr(self, name)
             require(value == math.inf or (_is_number(value) and value > 0.0), name, "a number above 0", value)
-        most = {"latency_s": 10.0, "noise_position_m": 1.0, "noise_heading_rad": math.pi, "mismatch": 0.9}
-        for name in (*most, "dry_friction_n", "dry_friction_nm", "disturbance_n"):
-            value, limit = getattr(self, name), most.get(name, math.inf)
+        limits = {"latency_s": 10.0, "noise_position_m": 1.0, "noise_heading_rad": math.pi, "mismatch": 0.9}
+        for name in (*limits, "dry_friction_n", "dry_friction_nm", "disturbance_n"):
+            value, limit = getattr(self, name), limits.get(name, math.inf)
             must_be = "a finite number of at least 0" + ("" if limit == math.inf else f" and at most {limit:g}")
             require(_is_number(value) and 0.0 <= value <= limit, name, must_be, value)
         require(

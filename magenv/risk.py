@@ -30,7 +30,8 @@ _TURNS = 6
 def lean_on(by: Floats, weights: Floats, doubt: Floats, lean: Floats) -> float:
     """Write the doubt (12,) that grows most into weighted errors, scaled; return by how much, zero where there is none.
 
-    ``by`` (12, 12) holds the derivatives of the last state by the first, ``doubt`` (12, 12) a root of its covariance.
+    ``by`` (12, 12) holds the derivatives of the last state by the first, ``doubt`` (12, 12) a root of its covariance,
+    ``weights`` (12,) those of errors.
     """
     grown, along, square = np.zeros((STATE, STATE)), np.ones(STATE), 0.0
     add_product(by, doubt, grown)
@@ -69,8 +70,9 @@ def risk(
     jacobian: Floats,
     differentiated: bool,
 ) -> float:
-    """Write what is leant on makes of the last errors below them into the residuals; return its cost.
+    """Write what is leant on makes of the last errors below them into the residuals (r,); return its cost.
 
+    ``lean`` (12,) is added to ``start`` (12,), ``scale`` by how much it was scaled; ``pushing`` (6,) acts, N and N m.
     Where ``differentiated``, the derivatives by the command are written into the last columns of ``jacobian`` (r, z).
     """
     rows = STATE * len(goal.marks)
@@ -80,7 +82,10 @@ def risk(
     cost, first = 0.0, jacobian.shape[1] - width
     for i in range(STATE):
         last, at = rows - STATE + i, rows + i
-        residuals[at] = (errors[last] - residuals[last]) / scale
+        grown, turn = errors[last] - residuals[last], 2.0 * math.pi * goal.weights[i]
+        if (i == 2 or i == 5) and abs(grown) > 0.5 * turn:  # one of the two errors was wrapped
+            grown -= math.copysign(turn, grown)
+        residuals[at] = grown / scale
         cost += residuals[at] * residuals[at]
         for c in range(width):
             jacobian[at, first + c] = (by[last, c] - jacobian[last, first + c]) / scale

@@ -264,8 +264,8 @@ def _hold(
 def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool) -> Step:
     """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
 
-    Mode, number of EPMs and of lanes, how commands act and whether the plant is rough are constants of the machine code: of the branches
-    one is compiled.
+    Mode, number of EPMs and of lanes, how commands act and whether the plant is rough are constants of the machine
+    code: of the branches one is compiled.
     """
     shape = hold_shape(n_epm, width, moves, rough)
 

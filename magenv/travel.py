@@ -135,12 +135,12 @@ def ramp(way: float, rise: float) -> tuple[int, int]:
     """Return the substeps of rising and of constant speed of a move.
 
     ``way`` is how many substeps at full speed would take, ``rise`` the share of full speed by which it changes in a
-    substep. Speed rises in ``up`` steps, stays for ``flat`` and falls in ``up`` - 1: in all up (up + flat) steps' worth.
+    substep. Speed rises in ``up`` steps, stays for ``flat`` and falls in ``up`` - 1: up (up + flat) first steps.
     """
     if way * rise <= 1.0:  # full speed is not reached
-        return max(1, int(math.ceil(math.sqrt(way / rise)))), 0
-    up = max(1, int(math.ceil(1.0 / rise)))
-    return up, max(0, int(math.ceil(way - up)))
+        return max(1, math.ceil(math.sqrt(way / rise))), 0
+    up = max(1, math.ceil(1.0 / rise))
+    return up, max(0, math.ceil(way - up))
 
 
 @law
@@ -157,13 +157,15 @@ def _set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: fl
 @law
 def _left(lanes: Floats, i: int, w: int) -> float:
     """Return the substeps left of the way whose fields begin at ``w``."""
-    return lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i]
+    left: float = lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i]
+    return left
 
 
 @law
 def _stopping(lanes: Floats, i: int, w: int) -> float:
     """Return the substeps that the way whose fields begin at ``w`` goes on for if it brakes from now on."""
-    return max(lanes[w + _DOWN, i] - lanes[w + _UP, i], 0.0)
+    stopping: float = max(lanes[w + _DOWN, i] - lanes[w + _UP, i], 0.0)
+    return stopping
 
 
 @law

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Rotation = Callable[[float], Floats]
 
-pytest.register_assert_rewrite("lane", "messages", "rollouts", "tiny_runs")  # so that their asserts tell values
+pytest.register_assert_rewrite("lane", "messages", "planned", "rollouts", "tiny_runs")  # so that they tell values
 
 
 @pytest.fixture
