@@ -53,7 +53,8 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     hold; see ``magenv.task``. Success is measured apart from it.
 
     ## Starting state
-    On the reference, at rest, with an offset of 1 mm and 3 degrees standard deviation; EPMs at home.
+    On the reference, at rest, with an offset of 1 mm and 3 degrees standard deviation; EPMs at home, or where commands
+    act late, at poses that hold nominal robots.
 
     ## Episode end
     *Terminated* where control is lost: a robot over 30 mm from its reference, bodies touching, or the wall reached
@@ -65,7 +66,10 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     |---|---|---|
     | ``scenario`` | ``random`` | ``random`` (training family), ``approach-<s>``, ``approach-<s>-anti``, s in mm |
     | ``plant`` | ``paper`` | EPMs jump to their commanded poses, no noise; ``moving``: they go there at 1 m/s and |
-    | | | 180 degrees/s at most, give way to each other, and act on the robots on the way |
+    | | | 180 degrees/s at most, give way to each other, and act on the robots on the way; ``arm``: these moves begin |
+    | | | and end at rest (5 m/s^2, 10 rad/s^2), commands act 0.1 s late, noise is 1.3 mm and 1.1 degrees, |
+    | | | masses, drags and moments differ by up to 20 % from the nominal ones, anew in each episode; ``low-drag``, |
+    | | | ``high-drag``: ``paper`` at the ends of what drag may be |
     | ``n_epm`` | 2 | 2 or 3 |
     | ``action`` | ``home`` | see above |
     | ``observation`` | ``full`` | ``full`` or ``errors`` |

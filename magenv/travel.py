@@ -51,8 +51,10 @@ _OPPOSITE = 1e-6
 """Sine below which two directions count as opposite: any way round is the shortest."""
 _UPRIGHT = 0.9999
 """Height above which a unit vector has no horizontal one beside it to speak of."""
+_LESS = 1e-9
+"""Part of a substep that is none: more than rounding can be."""
 _ASIDE = 0.25
-"""Share of what a centre may go in a substep by which it steps aside."""
+"""Share of a centre's step by which it steps aside: less than the half that it goes, so that it never stands for it."""
 
 
 class Motion(NamedTuple):
@@ -138,9 +140,9 @@ def ramp(way: float, rise: float) -> tuple[int, int]:
     substep. Speed rises in ``up`` steps, stays for ``flat`` and falls in ``up`` - 1: up (up + flat) first steps.
     """
     if way * rise <= 1.0:  # full speed is not reached
-        return max(1, math.ceil(math.sqrt(way / rise))), 0
-    up = max(1, math.ceil(1.0 / rise))
-    return up, max(0, math.ceil(way - up))
+        return max(1, math.ceil(math.sqrt(way / rise) - _LESS)), 0
+    up = max(1, math.ceil(1.0 / rise - _LESS))
+    return up, max(0, math.ceil(way - up - _LESS))
 
 
 @law
@@ -344,13 +346,15 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
             _brake(lanes, i, route(n_epm, k) + _WAY)
         return
     centres, waits, creep = np.zeros((n_epm, EPM_SIZE)), not slow, min(motion.rise, 1.0) * motion.reach
+    steps = np.empty(n_epm)
     for k in range(n_epm):
         e = route(n_epm, k)
+        steps[k] = math.sqrt(_distance2(lanes, i, e + _CENTRE, e + _NEXT))
         for axis in range(3):
             centres[k, axis] = 0.5 * (lanes[e + _CENTRE + axis, i] + lanes[e + _NEXT + axis, i])
     for k in range(1, n_epm):
         for j in range(k):
-            _step_aside(centres[j], centres[k], motion.gap, _ASIDE * creep)
+            _step_aside(centres[j], centres[k], motion.gap, _ASIDE * max(steps[j], steps[k]))
     project_epms(centres, motion.r_min, motion.r_max, motion.gap)
     for k in range(n_epm):
         x, y, z = _read(lanes, i, route(n_epm, k) + _CENTRE)

@@ -68,7 +68,8 @@ def test_limits_hold_all_the_way(rng: np.random.Generator, n_epm: int) -> None:
     moved = np.linalg.norm(np.diff(centres, axis=0), axis=-1)
     assert moved.max() < PLANT.epm_speed_mps * H * (1.0 + 1e-8)
     assert moved.max() > PLANT.epm_speed_mps * H * 0.99
-    assert angle(moments[1:], moments[:-1]).max() == pytest.approx(PLANT.epm_turn_radps * H, rel=1e-6)
+    turned_by = angle(moments[1:], moments[:-1]).max() / (PLANT.epm_turn_radps * H)
+    assert 0.99 < turned_by < 1.0 + 1e-6
     for k in range(n_epm):
         for j in range(k):
             gaps = np.linalg.norm(centres[:, :, k] - centres[:, :, j], axis=-1)
@@ -102,8 +103,10 @@ def evenly(start: Floats, goal: Floats, times: Floats) -> tuple[Floats, float]:
     """
     near, far = np.linalg.norm(start[:3]), np.linalg.norm(goal[:3])
     around = angle(start[:3], goal[:3])
-    takes = math.hypot(max(near, far) * around, far - near) / PLANT.epm_speed_mps
-    turns = angle(start[3:], goal[3:]) / PLANT.epm_turn_radps
+    takes = H * math.ceil(
+        math.hypot(max(near, far) * around, far - near) / PLANT.epm_speed_mps / H - 1e-9
+    )  # whole substeps
+    turns = H * math.ceil(angle(start[3:], goal[3:]) / PLANT.epm_turn_radps / H - 1e-9)
     share = np.minimum(times / takes, 1.0)
     radii = (near + share * (far - near))[:, None]
     centres = radii * turned(start[:3] / near, goal[:3] / far, share)
@@ -116,7 +119,7 @@ def test_a_way_is_a_great_circle_gone_evenly() -> None:
     goal = start.copy()
     goal[0] = [0.0, 0.3 * math.cos(0.5), 0.3 * math.sin(0.5), 0.0, 1.0, 0.0]
     takes = evenly(start[0], goal[0], np.zeros(1))[1]
-    last = math.ceil(takes / H)
+    last = round(takes / H)
     for substeps in (1, 2, 40, last - 1, last, last + 3):
         task = TaskParams(control_hz=1.0 / (substeps * H), loss_distance_m=10.0)
         world = world_of(System(), start[None], PLANT, task)
@@ -197,7 +200,9 @@ def test_moments_stay_unit_vectors_whatever_is_commanded(rng: np.random.Generato
         before = world.epms.copy()
         world.step(goals, np.ones(20, np.bool_))
         np.testing.assert_allclose(np.linalg.norm(world.epms[..., 3:], axis=-1), 1.0, atol=1e-14)
-        np.testing.assert_allclose(angle(before[..., 3:], world.epms[..., 3:]), PLANT.epm_turn_radps * H, rtol=1e-6)
+        np.testing.assert_allclose(
+            angle(before[..., 3:], world.epms[..., 3:]), PLANT.epm_turn_radps * H, rtol=6e-3
+        )  # 200 or 201 substeps
 
 
 def test_the_last_substep_is_no_faster() -> None:
