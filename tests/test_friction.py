@@ -15,8 +15,9 @@ from magenv.lanes import FRICTION, PUSH_TURN1, PUSH_X1, PUSH_Y2, TURN_FRICTION
 from magenv.params import Body, Plant, System
 from magenv.sensitivity import Model
 
-MASS, INERTIA, H = 0.010, 1e-6, 0.005
-SLIPPERY = Plant(body=Body(mass_kg=MASS, inertia_kgm2=INERTIA, drag_linear_nspm=0.0, drag_rotational_nmsprad=0.0))
+MASS, INERTIA, H = np.array([0.010, 0.020]), np.array([1e-6, 3e-6]), 0.005
+"""kg and kg m^2 of the two robots; s."""
+SLIPPERY = Plant(body=Body(drag_linear_nspm=0.0, drag_rotational_nmsprad=0.0))
 NO_EPMS = np.zeros((0, 6))
 F, TAU = 2e-4, 1e-7
 """Dry friction, N and N m."""
@@ -26,7 +27,9 @@ def alone(velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
     """Lane (fields, 1) with both robots at the same velocity, free of drag, too far apart to feel each other."""
     robots = np.zeros((2, 6))
     robots[:, 0], robots[:, 3:] = [-1e3, 1e3], velocity
-    return one_lane(robots, NO_EPMS, Physics.of(System(), SLIPPERY, 1), H)
+    physics = Physics.of(System(), SLIPPERY, 1)
+    physics.mass[:], physics.inertia[:] = MASS, INERTIA
+    return one_lane(robots, NO_EPMS, physics, H)
 
 
 def states(lane: Floats) -> Floats:
@@ -44,19 +47,20 @@ def path(lane: Floats, steps: int) -> Floats:
 
 
 def test_friction_takes_its_force_over_the_mass_from_the_speed_and_then_brings_to_rest() -> None:
-    """0.05 m/s and 4 rad/s: at rest after 2.5 s and 40 s; the way is v^2 / 2a, and straight."""
+    """At 0.05 m/s robots are at rest after 2.5 s and 5 s; the way is v^2 / 2a, and straight. 4 rad/s last longer."""
     lane = alone((0.03, -0.04, -4.0))
     lane[FRICTION], lane[TURN_FRICTION] = F, TAU
-    found = path(lane, 600)
-    speed, rate, time = np.hypot(*found[..., 3:5].T), found[..., 5].T, H * np.arange(601)
-    np.testing.assert_allclose(speed, [np.maximum(0.05 - F / MASS * time, 0.0)] * 2, atol=1e-15)
-    np.testing.assert_allclose(rate, [-4.0 + TAU / INERTIA * time] * 2, rtol=1e-12)
-    moving = speed[0] > 1e-12
-    np.testing.assert_allclose(found[moving][:, 0, 3] / speed[0, moving], 0.6, rtol=1e-12)
-    assert (found[501:, :, 3:5] == 0.0).all(), "at rest, and not merely slow"
-    np.testing.assert_array_equal(found[-1, :, :2], found[501, :, :2])
-    way = found[-1, 0, :2] - found[0, 0, :2]
-    np.testing.assert_allclose(way, 0.5 * 0.05**2 / (F / MASS) * np.array([0.6, -0.8]), atol=1e-9)
+    found = path(lane, 1100)
+    speed, rate, time = np.hypot(*found[..., 3:5].T), found[..., 5].T, H * np.arange(1101)
+    np.testing.assert_allclose(speed, np.maximum(0.05 - F / MASS[:, None] * time, 0.0), atol=1e-15)
+    np.testing.assert_allclose(rate, -4.0 + TAU / INERTIA[:, None] * time, rtol=1e-12)
+    for robot, rest in ((0, 501), (1, 1001)):
+        moving = speed[robot] > 1e-12
+        np.testing.assert_allclose(found[moving, robot, 3] / speed[robot, moving], 0.6, rtol=1e-12)
+        assert (found[rest:, robot, 3:5] == 0.0).all(), "at rest, and not merely slow"
+        np.testing.assert_array_equal(found[-1, robot, :2], found[rest, robot, :2])
+        way = found[-1, robot, :2] - found[0, robot, :2]
+        np.testing.assert_allclose(way, 0.5 * 0.05**2 / (F / MASS[robot]) * np.array([0.6, -0.8]), atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.999])
@@ -76,8 +80,8 @@ def test_above_the_limit_the_rest_of_the_force_accelerates() -> None:
     lane[FRICTION], lane[TURN_FRICTION] = F, TAU
     lane[PUSH_X1], lane[PUSH_TURN1] = 3 * F, -1.5 * TAU  # on robot 1 alone
     found, time = path(lane, 50), H * np.arange(51)
-    np.testing.assert_allclose(found[:, 0, 3], 2 * F / MASS * time, rtol=1e-12)
-    np.testing.assert_allclose(found[:, 0, 5], -0.5 * TAU / INERTIA * time, rtol=1e-12)
+    np.testing.assert_allclose(found[:, 0, 3], 2 * F / MASS[0] * time, rtol=1e-12)
+    np.testing.assert_allclose(found[:, 0, 5], -0.5 * TAU / INERTIA[0] * time, rtol=1e-12)
     assert np.abs(found[:, 0, 4]).max() < 1e-20  # the other robot is two kilometres away
     assert (found[:, 1, 3:] == 0.0).all()
 
@@ -86,7 +90,9 @@ def test_a_push_accelerates_its_own_robot() -> None:
     pushes = np.array([[1e-4, -2e-4, 3e-8], [-3e-4, 4e-4, -5e-8]])
     lane = alone()
     lane[PUSH_X1 : PUSH_X1 + 6, 0] = pushes.T.ravel()
-    np.testing.assert_allclose(path(lane, 10)[-1, :, 3:], pushes / [MASS, MASS, INERTIA] * 10 * H, rtol=1e-12)
+    np.testing.assert_allclose(
+        path(lane, 10)[-1, :, 3:], pushes / np.stack([MASS, MASS, INERTIA], axis=1) * 10 * H, rtol=1e-12
+    )
 
 
 def test_friction_never_turns_a_motion_round_nor_speeds_it_up(rng: np.random.Generator) -> None:
