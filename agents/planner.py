@@ -20,7 +20,6 @@ from magenv.manoeuvre import Arms, move
 from magenv.params import InputError, Plant, System
 from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
 from magenv.sensitivity import COORDINATES, Model
-from magenv.travel import Motion as Limits
 from magenv.wrench import WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
@@ -69,7 +68,7 @@ class Planner:
         self._system, self._plant, self._period_s, self._stages = system, plant, period_s, stages
         self.model = Model.of(system, plant, period_s / substeps)
         n, travels = system.n_epm, not plant.epms_jump
-        self._arms = Arms(Limits.of(system, plant, self.model.substep, substeps), substeps, travels)
+        self._arms = Arms.of(system, plant, self.model.substep, substeps)
         self._motion = Motion.of(n, substeps, travels)
         self._parts = [Motion.of(n, max(1, round(share * substeps)), travels) for share in PARTS]
         self._scratch, self._single = Scratch.of(stages, n, 1), Scratch.of(1, n, 1)

@@ -12,6 +12,7 @@ from magenv.angles import sincos
 from magenv.arithmetic import dot3
 from magenv.forecast import Motion
 from magenv.kernels import kernel
+from magenv.params import Plant, System
 from magenv.poses import project_epms
 from magenv.travel import Motion as Limits
 from magenv.travel import ramp, way_round
@@ -31,6 +32,11 @@ class Arms(NamedTuple):
     """Of a command's time, in which the EPMs are to arrive."""
     travels: bool
     """Whether they travel, or jump."""
+
+    @classmethod
+    def of(cls, system: System, plant: Plant, substep_s: float, substeps: int) -> Arms:
+        """Return the limits of a system on a plant, for commands of so many substeps."""
+        return cls(Limits.of(system, plant, substep_s, substeps), substeps, not plant.epms_jump)
 
 
 @kernel

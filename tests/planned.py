@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from magenv.forecast import STATE, Goal, Motion
 from magenv.horizon import Scratch, plan
 from magenv.manoeuvre import Arms
-from magenv.params import System
+from magenv.params import Plant, System
 from magenv.sensitivity import Model
 
 SUBSTEPS = 20
@@ -56,7 +56,12 @@ class Task:
             references.append(end + 0.2 * NATURAL * rng.normal(size=STATE))
         goal = goal_of(np.array(references), (SUBSTEPS,), weights, wander)
         return cls(
-            model, state, before, goal, Arms.of(system), doubt * NATURAL[:, None] * rng.normal(size=(STATE, STATE))
+            model,
+            state,
+            before,
+            goal,
+            Arms.of(system, Plant(), model.substep, 100),
+            doubt * NATURAL[:, None] * rng.normal(size=(STATE, STATE)),
         )
 
     @property
@@ -101,9 +106,9 @@ class Task:
         """Least cost that SciPy finds for a single command from ``base`` (N, 6), the least gap left aside."""
         radii = np.linalg.norm(base[:, :3], axis=1)
         low, high = np.full((len(base), 5), -2.0), np.full((len(base), 5), 2.0)
-        low[:, 2], high[:, 2] = self.arms.r_min - radii - 1e-9, self.arms.r_max - radii + 1e-9
+        low[:, 2], high[:, 2] = self.arms.limits.r_min - radii - 1e-9, self.arms.limits.r_max - radii + 1e-9
         found = least_squares(
-            lambda x: self.residuals(shifted(base, x, self.arms.r_min, self.arms.r_max)[None]),
+            lambda x: self.residuals(shifted(base, x, self.arms.limits.r_min, self.arms.limits.r_max)[None]),
             np.zeros(5 * len(base)),
             bounds=(low.ravel(), high.ravel()),
             x_scale=np.tile([0.03, 0.03, 0.01, 0.03, 0.03], len(base)),

@@ -20,7 +20,6 @@ from magenv.forecast import Motion
 from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.trajectories import approach
-from magenv.travel import Motion as Limits
 from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
 
@@ -104,7 +103,7 @@ def test_a_command_given_again_changes_nothing(rng: np.random.Generator) -> None
 
 def test_the_motion_foreseen_is_the_motion(rng: np.random.Generator) -> None:
     system, substeps = System(), 100
-    arms = Arms(Limits.of(system, PROMPT, H, substeps), substeps, True)
+    arms = Arms.of(system, PROMPT, H, substeps)
     motion, checked = Motion.of(2, substeps, True), 0
     for _ in range(20):
         start, goal = magnets(rng), magnets(rng)

@@ -46,20 +46,20 @@ def test_commands_keep_to_radii_and_gap(n_epm: int) -> None:
         task.goal.references[:] += 10 * NATURAL * rng.normal(size=STATE)
         task.before[:, :3] += rng.normal([0.1, 0.0, 0.0], 0.1)
         task.before[0, :3] = task.before[1, :3] + 0.01
-        project_epms(task.before, task.arms.r_min, task.arms.r_max, task.arms.gap)
+        project_epms(task.before, task.arms.limits.r_min, task.arms.limits.r_max, task.arms.limits.gap)
         commands = task.start()
         first, cost = task.cost(commands), task.plan(commands, iterations=8)
         assert cost < first
         radii = np.linalg.norm(commands[..., :3], axis=-1)
         pairs = itertools.combinations(range(n_epm), 2)
         gaps = [np.linalg.norm(commands[:, i, :3] - commands[:, k, :3], axis=-1).min() for i, k in pairs]
-        assert radii.min() >= task.arms.r_min - 1e-9
-        assert radii.max() <= task.arms.r_max + 1e-9
-        assert min(gaps) >= task.arms.gap - 1e-9
+        assert radii.min() >= task.arms.limits.r_min - 1e-9
+        assert radii.max() <= task.arms.limits.r_max + 1e-9
+        assert min(gaps) >= task.arms.limits.gap - 1e-9
         np.testing.assert_allclose(np.linalg.norm(commands[..., 3:], axis=-1), 1.0, rtol=1e-12)
         nearest, inmost, outmost = min(nearest, *gaps), min(inmost, radii.min()), max(outmost, radii.max())
-    assert nearest < task.arms.gap + 1e-6
-    assert inmost < task.arms.r_min + 1e-6
+    assert nearest < task.arms.limits.gap + 1e-6
+    assert inmost < task.arms.limits.r_min + 1e-6
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 20])

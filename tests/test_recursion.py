@@ -10,7 +10,7 @@ from planned import PUSH, SUBSTEPS, Task
 from magenv.forecast import STATE, Motion
 from magenv.horizon import Scratch, _backward, _linearise
 from magenv.manoeuvre import Arms
-from magenv.params import System
+from magenv.params import Plant, System
 
 
 def joint(s: Scratch) -> tuple[Floats, Floats]:
@@ -38,7 +38,7 @@ def followed(s: Scratch) -> Floats:
 
 @pytest.fixture
 def arms() -> Arms:
-    return Arms.of(System())
+    return Arms.of(System(), Plant(), 0.005, 100)
 
 
 def random_problem(rng: np.random.Generator, stages: int) -> tuple[Scratch, Floats]:
@@ -103,8 +103,8 @@ def test_radii_at_a_bound_stay_there_and_all_else_is_solved(rng: np.random.Gener
     found = set()
     for _ in range(10):
         s, commands = random_problem(rng, stages)
-        commands[:, 0, 2], commands[:, 0, 1] = arms.r_min, 0.0
-        commands[:, 1, 2], commands[:, 1, 1] = arms.r_max, 0.0
+        commands[:, 0, 2], commands[:, 0, 1] = arms.limits.r_min, 0.0
+        commands[:, 1, 2], commands[:, 1, 1] = arms.limits.r_max, 0.0
         assert _backward(commands, arms, 0.0, s)
         free = (s.gains != 0.0).any(axis=2)
         assert free[:, [i for i in range(10) if i not in (2, 7)]].all()
