@@ -37,6 +37,20 @@ def test_where_the_last_steps_are_slow_little_is_left(n_epm: int, seed: int) -> 
     assert task.best(commands[0]) > cost - 2e-3 * first
 
 
+@pytest.mark.parametrize("stages", [2, 3])
+@pytest.mark.parametrize("seed", [0, 1, 3, 5])
+def test_near_the_best_one_iteration_is_enough(seed: int, stages: int) -> None:
+    """Later commands answer to what earlier ones change: of what a change of all costs, a thousandth is left."""
+    task, rng = Task.draw(seed, 2 + seed % 2, stages, wander=0.3), np.random.default_rng(seed)
+    commands = task.start()
+    best = min(task.plan(commands) for _ in range(6))
+    steps = rng.normal(0.0, 2e-3, (stages, len(task.before), 5)) * [1.0, 1.0, 0.1, 1.0, 1.0]
+    away = np.stack([shifted(*pair) for pair in zip(commands, steps.reshape(stages, -1), strict=True)])
+    before = task.cost(away)
+    assert before > 1.2 * best
+    assert task.plan(away, iterations=1) - best < 1e-3 * (before - best)
+
+
 @pytest.mark.parametrize("n_epm", [2, 3])
 def test_commands_keep_to_radii_and_gap(n_epm: int) -> None:
     """Goals out of reach, from EPMs that stand at the gap: bounds are met, and kept within 1e-9 m."""

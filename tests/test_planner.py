@@ -49,6 +49,15 @@ def test_a_good_plan_is_found_from_elsewhere(stages: int, n_epm: int) -> None:
     np.testing.assert_array_equal(last, kept)
 
 
+def test_commands_made_one_after_another_are_good_before_they_are_improved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each reckons with where the one before lands, and aims at a reference of its own."""
+    planner, problem = a_planner(3, 3), a_problem(3, 3)
+    monkeypatch.setattr(planner, "_polish", lambda problem, commands: cost_of(planner, problem, commands))
+    costs = [planner._from_statics(problem, math.inf, np.random.default_rng(seed))[0] for seed in range(5)]
+    assert min(costs) < 0.1
+    assert np.median(costs) < ENOUGH
+
+
 def test_a_good_plan_is_kept_and_nothing_drawn() -> None:
     planner, problem = a_planner(2), a_problem(2)
     good, cost, _ = planner.plan(problem, np.repeat(problem.before[None], 2, axis=0), np.random.default_rng(0))

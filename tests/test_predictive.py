@@ -95,6 +95,18 @@ def test_its_plans_come_from_the_last_one(make_env: MakeEnv) -> None:
     assert ways[3:].max() < 0.05
 
 
+def test_a_plan_begins_with_what_the_last_one_planned_for_later(make_env: MakeEnv) -> None:
+    """At 20 Hz four commands are planned: the first is given, the others move up, and the last is kept twice."""
+    env, agent = make_env(scenario="approach-60", action="pose", control_hz=20.0), Predictive(2, 20.0)
+    (action,), state = agent.predict(first(env, 0)[None])
+    later = state.rows[0].commands
+    assert later.shape == (4, 2, 6)
+    np.testing.assert_array_equal(later[3], later[2])
+    told = [pose_to_action(from_cartesian(epms[:, :3], epms[:, 3:]), System()).astype(np.float32) for epms in later]
+    for one, other in zip([action, *told[:2]], told[:3], strict=True):
+        assert np.abs(one - other).max() > 1e-4
+
+
 def test_its_seed_fixes_its_actions(make_env: MakeEnv) -> None:
     """At the start of this episode a plan is sought elsewhere, from random starts."""
     observation = first(make_env(scenario="approach-30"), 0)
