@@ -116,3 +116,16 @@ class Task:
             xtol=1e-8,
         )
         return float(2.0 * found.cost)
+
+
+def joint(s: Scratch) -> tuple[Floats, Floats]:
+    """Residuals of all commands and their derivatives by all steps of the commands, as one least-squares problem."""
+    stages, u = s.gains.shape[:2]
+    steps, state = np.zeros((stages + 1, u, stages * u)), np.zeros((STATE, stages * u))
+    rows = []
+    for k in range(stages):
+        steps[k + 1, :, u * k : u * k + u] = np.eye(u)
+        z = np.concatenate([steps[k], state, steps[k + 1]])
+        rows.append(s.jacobians[k] @ z)
+        state = s.by[k] @ z
+    return s.residuals.ravel(), np.concatenate(rows)

@@ -5,25 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from foreseen import CERTAIN, Floats, shifted
-from planned import PUSH, SUBSTEPS, Task
+from planned import PUSH, SUBSTEPS, Task, joint
 
 from magenv.forecast import STATE, Motion
 from magenv.horizon import Scratch, _backward, _linearise
 from magenv.manoeuvre import Arms
 from magenv.params import Plant, System
-
-
-def joint(s: Scratch) -> tuple[Floats, Floats]:
-    """Residuals of all commands and their derivatives by all steps of the commands, as one least-squares problem."""
-    stages, u = s.gains.shape[:2]
-    steps, state = np.zeros((stages + 1, u, stages * u)), np.zeros((STATE, stages * u))
-    rows = []
-    for k in range(stages):
-        steps[k + 1, :, u * k : u * k + u] = np.eye(u)
-        z = np.concatenate([steps[k], state, steps[k + 1]])
-        rows.append(s.jacobians[k] @ z)
-        state = s.by[k] @ z
-    return s.residuals.ravel(), np.concatenate(rows)
 
 
 def followed(s: Scratch) -> Floats:
