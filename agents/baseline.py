@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.controller import RowGenerators
 from agents.pid import Gains, PIDState, pid_wrench
 from magenv.actions import ActionMode, planar_target, pose_to_action
 from magenv.allocation import allocate
@@ -59,8 +60,7 @@ class Baseline:
 
     def seed(self, seed: int) -> None:
         """Fix the random starts to come."""
-        self._seeds = np.random.SeedSequence(seed)
-        self._rngs = [np.random.default_rng(self._seeds)]
+        self._rngs = RowGenerators(seed)
 
     def predict(
         self,
@@ -78,9 +78,7 @@ class Baseline:
         elif episode_start is not None:
             state.restart(episode_start)
         desired = pid_wrench(parts.error, state, self._gains, self._period_s)
-        missing = len(batch) - len(self._rngs)  # each row has random numbers of its own, whatever the others draw
-        self._rngs += [np.random.default_rng(child) for child in self._seeds.spawn(max(missing, 0))]
-        rows = zip(desired, parts.robots, present, self._rngs[: len(batch)], strict=True)
+        rows = zip(desired, parts.robots, present, self._rngs.of(len(batch)), strict=True)
         poses = np.stack([self._allocate(*row) for row in rows])
         actions = np.stack([pose_to_action(pose, self._system) for pose in poses])
         return actions.reshape(*np.shape(observation)[:-1], -1), state

@@ -82,6 +82,20 @@ class Controller(Protocol):
         ...
 
 
+class RowGenerators:
+    """Random numbers of a controller's rows: each row has its own, whatever the others draw."""
+
+    def __init__(self, seed: int) -> None:
+        self._seeds = np.random.SeedSequence(seed)
+        self._rngs = [np.random.default_rng(self._seeds)]
+
+    def of(self, n: int) -> list[np.random.Generator]:
+        """Return the generators of ``n`` rows; the first is the one of a single row."""
+        missing = max(n - len(self._rngs), 0)
+        self._rngs += [np.random.default_rng(child) for child in self._seeds.spawn(missing)]
+        return self._rngs[:n]
+
+
 class Idle:
     """Leaves the EPMs at home, in the frame that the robots carry."""
 

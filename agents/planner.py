@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magenv.actions import planar_target
 from magenv.allocation import allocate
-from magenv.forecast import STATE, Goal, Motion
+from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms, move
 from magenv.params import InputError, Plant, System
@@ -69,8 +69,8 @@ class Planner:
         self.model = Model.of(system, plant, period_s / substeps)
         n, travels = system.n_epm, not plant.epms_jump
         self._arms = Arms.of(system, plant, self.model.substep, substeps)
-        self._motion = Motion.of(n, substeps, travels)
-        self._parts = [Motion.of(n, max(1, round(share * substeps)), travels) for share in PARTS]
+        self._motion = Course.of(n, substeps, travels)
+        self._parts = [Course.of(n, max(1, round(share * substeps)), travels) for share in PARTS]
         self._scratch, self._single = Scratch.of(stages, n, 1), Scratch.of(1, n, 1)
 
     def plan(self, problem: Problem, last: Floats, rng: np.random.Generator) -> tuple[Floats, float, bool]:
@@ -82,16 +82,19 @@ class Planner:
         if not np.isfinite([*problem.state, *problem.pushing]).all():
             return best, math.inf, sought
         cost = self._polish(problem, best)
-        turn, enough = 0, ENOUGH * self._stages
-        # EPMs that travel come only where the last plan, too, can be bent to
-        most = 0 if self._arms.travels else SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
-        while not cost < enough and turn < most:
+        turn = 0
+        while not cost < ENOUGH * self._stages and turn < self._searches(cost):
             new, commands = self._from_statics(problem, cost, rng)
             if new < cost:
                 best, cost, sought = commands, new, True
-                most = SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
             turn += 1
         return best, cost, sought
+
+    def _searches(self, cost: float) -> int:
+        """Return how often another plan is sought at most, while the best one has this cost."""
+        if self._arms.travels:  # EPMs come only where the last plan, too, can be bent to
+            return 0
+        return SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
 
     def path(self, before: Floats, command: Floats) -> Floats:
         """Return where the EPMs are in each substep (M, N, 6) of a command's time, the ones before standing there."""

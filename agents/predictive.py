@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.controller import RowGenerators
 from agents.planner import ENOUGH, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
-from magenv.forecast import STATE, Goal, Motion
+from magenv.forecast import STATE, Course, Goal
 from magenv.observer import KNOWN, Noise, correct, forecast
 from magenv.params import PLANTS, Plant, System, TaskParams, choose, require
-from magenv.poses import from_cartesian
+from magenv.poses import POSE_SIZE, from_cartesian
 from magenv.sensitivity import COORDINATES
 from magenv.task import Frame, Layout, ObservationMode, unpack
 
@@ -35,8 +36,13 @@ _DRIFT_N, _DRIFT_NM = 1e-2, 1e-4
 """By what a push drifts in a second, per mismatch of the parameters: the EPMs move, and with them what is amiss."""
 _AMISS_N, _AMISS_NM = 2e-2, 3e-4
 """Push at the beginning, per mismatch."""
-WANDER = 0.0
-"""Weight of a command's change where the EPMs travel."""
+_START_MPS, _START_RADPS = 1e-3, 1e-3
+"""Rates that an episode may begin with."""
+
+_LOST = 1.0
+"""Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
+_WANDER = 0.0
+"""Weight of a command's change."""
 
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
 """How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
@@ -99,15 +105,13 @@ class Predictive:
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
         self._stages = min(4, max(1, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
-        self._held = Motion.of(n_epm, self._substeps, True)
+        self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
         require(
             self._lag <= self._substeps, "control_hz", f"at most {1 / max(self._plant.latency_s, 1e-9):g}", control_hz
         )
-        self._weights = np.concatenate(
-            [_per_coordinate(1 / POSITION_M, 1 / HEADING_RAD), _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)]
-        )
-        self._weights[COORDINATES:] *= SETTLING_S
+        weights = _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)
+        self._weights = np.concatenate([weights, SETTLING_S * weights])
         self._noise = _noise(self._plant)
         amiss = self._plant.mismatch
         self._pushed = _per_coordinate(_PUSH_N + _AMISS_N * amiss, _PUSH_NM + _AMISS_NM * amiss) ** 2
@@ -118,8 +122,7 @@ class Predictive:
 
     def seed(self, seed: int) -> None:
         """Fix the random starts to come."""
-        self._seeds = np.random.SeedSequence(seed)
-        self._rngs = [np.random.default_rng(self._seeds)]
+        self._rngs = RowGenerators(seed)
 
     def predict(
         self,
@@ -134,11 +137,9 @@ class Predictive:
         n = len(batch)
         if state is None:
             state = PredictiveState([None] * n, np.zeros(n, np.int64))
-        missing = n - len(self._rngs)  # each row has random numbers of its own, whatever the others draw
-        self._rngs += [np.random.default_rng(child) for child in self._seeds.spawn(max(missing, 0))]
-        actions = np.empty((n, self._system.n_epm * 5), np.float32)
+        actions = np.empty((n, POSE_SIZE * self._system.n_epm), np.float32)
         epms = np.concatenate([parts.epm_positions, parts.epm_directions], axis=-1)
-        for i in range(n):
+        for i, rng in enumerate(self._rngs.of(n)):
             memory = None if episode_start is not None and episode_start[i] else state.rows[i]
             measured = parts.robots[i].reshape(-1)
             if memory is None:
@@ -146,7 +147,7 @@ class Predictive:
             else:
                 self._update(memory, measured, epms[i])
             goal = self._goal(parts.reference[i].reshape(-1, COORDINATES))
-            state.status[i] = self._decide(memory, goal, epms[i], self._rngs[i])
+            state.status[i] = self._decide(memory, goal, epms[i], rng)
             state.rows[i] = memory
             command = memory.commands[0]
             actions[i] = pose_to_action(from_cartesian(command[:, :3], command[:, 3:]), self._system)
@@ -165,16 +166,21 @@ class Predictive:
         return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0), epms, paths)
 
     def _update(self, memory: Memory, measured: Floats, epms: Floats) -> None:
-        """Carry the estimate over the last hold and correct it, then go on to the present one."""
+        """Carry the estimate over the last hold and correct it; one that was lost is begun anew."""
         if self._lag == 0 and self._plant.epms_jump:
             memory.paths[self._substeps :] = epms  # what was commanded, as it was carried out
-        self._follow(memory.paths, 0, self._substeps, memory.known, memory.covariance)
+        first = self._substeps - self._lag  # commands act late
+        self._follow(memory.paths[first : first + self._substeps], memory.known, memory.covariance)
+        if not np.abs(memory.covariance[:COORDINATES]).max() < _LOST:  # NaN as well
+            fresh = self._begin(measured, epms)
+            memory.known, memory.covariance = fresh.known, fresh.covariance
+            return
         correct(measured, self._noise, memory.known, memory.covariance)
 
-    def _follow(self, paths: Floats, first: int, last: int, known: Floats, covariance: Floats) -> None:
-        """Carry an estimate over substeps of a hold, in which commands act late."""
-        self._held.path[:] = paths[self._substeps - self._lag : 2 * self._substeps - self._lag]
-        forecast(self._planner.model, self._held, first, last, self._noise, known, covariance)
+    def _follow(self, path: Floats, known: Floats, covariance: Floats) -> None:
+        """Carry an estimate over the substeps of a path (K, N, 6) of the EPMs."""
+        self._held.path[: len(path)] = path
+        forecast(self._planner.model, self._held, 0, len(path), self._noise, known, covariance)
 
     def _goal(self, references: Floats) -> Goal:
         """Return the goal at the ends of the commands' times, from the references (5, 6) told."""
@@ -185,19 +191,15 @@ class Predictive:
         share = self._lag / self._substeps  # commands act late, and so do their times end
         states[:-1, :COORDINATES] += share * turn[:3]
         states[:-1, COORDINATES:] += share * np.diff(states[:, COORDINATES:], axis=0)
-        return Goal(
-            np.array([self._substeps]),
-            states[: self._stages, None],
-            self._weights,
-            0.0 if self._plant.epms_jump else WANDER,
-        )
+        return Goal(np.array([self._substeps]), states[: self._stages, None], self._weights, _WANDER)
 
     def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
         """Write the best plan found into the memory; return how it was come by."""
         known, covariance, before = memory.known.copy(), memory.covariance.copy(), memory.before
         if self._lag > 0:  # until the command acts
-            paths = np.concatenate([memory.paths[self._substeps :], memory.paths[-self._substeps :]])
-            self._follow(paths, 0, self._lag, known, covariance)
+            self._follow(memory.paths[-self._lag :], known, covariance)
+            if not np.isfinite(covariance).all():
+                known, covariance = memory.known.copy(), memory.covariance.copy()
         elif self._plant.epms_jump:
             before = epms
         doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
@@ -207,10 +209,6 @@ class Predictive:
             memory.commands = np.repeat(before[None], self._stages, axis=0)
             return FALLBACK
         return UNSOLVED if cost > ENOUGH * self._stages else SOUGHT if sought else CONVERGED
-
-
-_START_MPS, _START_RADPS = 1e-3, 1e-3
-"""Rates that an episode may begin with."""
 
 
 def _root(covariance: Floats) -> Floats:

@@ -179,11 +179,19 @@ def place_epm(
 
 
 @law
-def place_all(lanes: Floats, i: int, moments: Floats, epms: Floats) -> None:
-    """Put EPMs (N, 6) of moments (N,) in A m^2 into lane ``i``."""
-    for k in range(len(epms)):
-        e = epms[k]
-        place_epm(lanes, i, k, moments[k], e[0], e[1], e[2], e[3], e[4], e[5])
+def copy_epms(source: Floats, row: int, target: Floats, to: int) -> None:
+    """Write the EPMs of a row (n, N, 6) into a row of ``target``; written out, as slices are functions to numba."""
+    for k in range(source.shape[1]):
+        for j in range(EPM_SIZE):
+            target[to, k, j] = source[row, k, j]
+
+
+@law
+def place_all(lanes: Floats, i: int, moments: Floats, epms: Floats, row: int) -> None:
+    """Put the EPMs (n, N, 6) of a row, of moments (n, N) in A m^2, into lane ``i``."""
+    for k in range(epms.shape[1]):
+        x, y, z = epms[row, k, 0], epms[row, k, 1], epms[row, k, 2]
+        place_epm(lanes, i, k, moments[row, k], x, y, z, epms[row, k, 3], epms[row, k, 4], epms[row, k, 5])
 
 
 @kernel

@@ -31,7 +31,7 @@ class Goal(NamedTuple):
     """Weight of a command's change, per rad and per 0.1 m of radius."""
 
 
-class Motion(NamedTuple):
+class Course(NamedTuple):
     """Where the EPMs are in a command's time, and how that depends on this command and the one before."""
 
     which: Integers
@@ -44,7 +44,7 @@ class Motion(NamedTuple):
     """Whether the EPMs travel, and so depend on the command before."""
 
     @classmethod
-    def of(cls, n_epm: int, substeps: int, travels: bool) -> Motion:
+    def of(cls, n_epm: int, substeps: int, travels: bool) -> Course:
         """Return room for the motion of so many substeps."""
         rows = substeps if travels else 1
         which = np.arange(substeps) if travels else np.zeros(substeps, np.int64)
@@ -73,7 +73,7 @@ def roll(
     model: Model,
     state: Floats,
     pushing: Floats,
-    motion: Motion,
+    motion: Course,
     goal: Goal,
     stage: int,
     sensitivity: Floats,

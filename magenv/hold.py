@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos, wrap
 from magenv.arithmetic import dot2
-from magenv.dynamics import TOUCH, WALL, advance, may_touch, place_all, resolve_contact
+from magenv.dynamics import TOUCH, WALL, advance, copy_epms, may_touch, place_all, resolve_contact
 from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
@@ -185,8 +185,8 @@ def hold_rows(
     code, so that the magnets are unrolled and the lanes vectorised.
 
     ``routes`` (n, N, 48) is how EPMs move from hold to hold, ``queue`` (n, 1 + wait, N, 6) the commands that do not act
-    yet, ``slow`` (n, 2, 3) angular frequencies (rad/s) and phases of x and y of the force that
-    disturbs each robot, ``rubs`` its amplitude (N) and dry friction (N, N m).
+    yet, ``slow`` (n, 2, 3) angular frequency (rad/s) and phases (rad) of the force that disturbs each robot, and
+    ``rubs`` its amplitude (N) and dry friction (N, N m).
     """
     wide_vectors()
     n_epm, width, rough = len(magnets), len(side_by_side), len(rubbing) > 0
@@ -209,15 +209,14 @@ def hold_rows(
                         lanes[X1 + j, i] = robots[row, j % 2, j // 2]
                     for j in range(CONSTANTS_SIZE):
                         lanes[CONSTANTS + j, i] = constants[row, j]
+                    if late:
+                        copy_epms(targets, row, queue[row], step[row] % queue.shape[1])
+                    else:
+                        copy_epms(targets, row, epms, row)
                     if travels:
                         take_up(lanes, i, epm_moment[row], epms[row], routes[row])
-                    elif late:
-                        place_all(lanes, i, epm_moment[row], epms[row])
                     else:
-                        epms[row] = targets[row]
-                        place_all(lanes, i, epm_moment[row], epms[row])
-                    if late:
-                        queue[row, step[row] % queue.shape[1]] = targets[row]
+                        place_all(lanes, i, epm_moment, epms, row)
                     if rough:
                         _disturb(lanes, i, slow[row], rubs, step[row] * period)
                     which = trajectory_of(row, len(duration))
@@ -246,8 +245,8 @@ def hold_rows(
                             if travels:
                                 command(lanes, i, queue[row, sent % queue.shape[1]])
                             else:
-                                epms[row] = queue[row, sent % queue.shape[1]]
-                                place_all(lanes, i, epm_moment[row], epms[row])
+                                copy_epms(queue[row], sent % queue.shape[1], epms, row)
+                                place_all(lanes, i, epm_moment, epms, row)
                         if travels:
                             set_off(lanes, i, n_epm, motion)
         rare = False

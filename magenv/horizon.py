@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from magenv.arithmetic import dot3
 from magenv.cholesky import add_product, add_transposed_product, factorise, solve
-from magenv.forecast import STATE, Goal, Motion, roll
+from magenv.forecast import STATE, Course, Goal, roll
 from magenv.kernels import kernel
 from magenv.local import local_basis, seen_from, shift
 from magenv.manoeuvre import Arms, allow, move
@@ -110,7 +110,7 @@ def _linearise(
     pushing: Floats,
     goal: Goal,
     arms: Arms,
-    motion: Motion,
+    motion: Course,
     before: Floats,
     doubt: Floats,
     commands: Floats,
@@ -207,7 +207,7 @@ def _forward(
     pushing: Floats,
     goal: Goal,
     arms: Arms,
-    motion: Motion,
+    motion: Course,
     before: Floats,
     commands: Floats,
     least: float,
@@ -259,7 +259,7 @@ def plan(
     doubt: Floats,
     goal: Goal,
     arms: Arms,
-    motion: Motion,
+    motion: Course,
     before: Floats,
     enough: float,
     iterations: int,
@@ -304,7 +304,7 @@ def land(
     pushing: Floats,
     goal: Goal,
     arms: Arms,
-    motion: Motion,
+    motion: Course,
     before: Floats,
     command: Floats,
 ) -> float:

@@ -10,23 +10,25 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos
 from magenv.arithmetic import dot3
-from magenv.forecast import Motion
+from magenv.forecast import Course
 from magenv.kernels import kernel
 from magenv.params import Plant, System
-from magenv.poses import project_epms
-from magenv.travel import Motion as Limits
-from magenv.travel import ramp, way_round
+from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, keeps_gap, project_epms
+from magenv.travel import Motion
+from magenv.ways import ramp, way_round
 
 Floats = NDArray[np.float64]
 
 _LESS = 1.0 - 1e-9
 """A little less than what is allowed: more than rounding can be."""
+_HALVINGS = 30
+"""Of the interval in which the greatest share lies by which centres keep the gap."""
 
 
 class Arms(NamedTuple):
     """What limits commands and the EPMs' motion to them."""
 
-    limits: Limits
+    limits: Motion
     """Of a substep."""
     substeps: int
     """Of a command's time, in which the EPMs are to arrive."""
@@ -36,7 +38,7 @@ class Arms(NamedTuple):
     @classmethod
     def of(cls, system: System, plant: Plant, substep_s: float, substeps: int) -> Arms:
         """Return the limits of a system on a plant, for commands of so many substeps."""
-        return cls(Limits.of(system, plant, substep_s, substeps), substeps, not plant.epms_jump)
+        return cls(Motion.of(system, plant, substep_s, substeps), substeps, not plant.epms_jump)
 
 
 @kernel
@@ -73,7 +75,7 @@ def _go_part(
     first: int,
     rise: float,
     reach: float,
-    motion: Motion,
+    motion: Course,
     k: int,
     differentiated: bool,
 ) -> None:
@@ -125,7 +127,7 @@ def _go_part(
 
 
 @kernel
-def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Motion, differentiated: bool) -> None:
+def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Course, differentiated: bool) -> None:
     """Write the motion from one command to the next, (N, 6) each; ``bases`` (2, N, 6, 5) are theirs."""
     if not arms.travels:
         motion.path[0] = command
@@ -139,27 +141,53 @@ def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Mot
 
 
 @kernel
-def _shorten(start: Floats, goal: Floats, radial: bool, most: float) -> None:
-    """Draw a goal (3,) back along the great circle until its way is at most ``most`` (m, or rad)."""
+def _within(start: Floats, goal: Floats, first: int, most: float) -> float:
+    """Return the share of the way from start to goal (3,) of a centre (``first`` 0) or moment (3) that is ``most``."""
+    near, u = _unit(start)
+    far, v = _unit(goal)
+    angle, _ = way_round(u, v)
+    arc, out = (max(near, far) * angle, far - near) if first == 0 else (angle, 0.0)
+    way = math.sqrt(arc * arc + out * out)
+    return 1.0 if way <= most else _LESS * most / way
+
+
+@kernel
+def _go_share(start: Floats, goal: Floats, share: float, out: Floats) -> None:
+    """Write where a share of the way from start to goal (3,) ends."""
     near, u = _unit(start)
     far, v = _unit(goal)
     angle, t = way_round(u, v)
-    arc, out = (max(near, far) * angle, far - near) if radial else (angle, 0.0)
-    way = math.sqrt(arc * arc + out * out)
-    if way <= most:
-        return
-    share = _LESS * most / way
     s, c = sincos(share * angle)
     for i in range(3):
-        goal[i] = (near + share * out if radial else 1.0) * (c * u[i] + s * t[i])
+        out[i] = goal[i] if share == 1.0 else (near + share * (far - near)) * (c * u[i] + s * t[i])
 
 
 @kernel
 def allow(arms: Arms, before: Floats, command: Floats) -> None:
-    """Make a command (N, 6) one that keeps radii and gap, and where the EPMs travel, one they arrive at in its time."""
+    """Make a command (N, 6) one that keeps radii and gap, and where the EPMs travel, one they arrive at in its time.
+
+    Centres that are too close where their time is over go less far, all by the same share: before, they were not.
+    """
     limits = arms.limits
     project_epms(command, limits.r_min, limits.r_max, limits.gap)
-    if arms.travels:
+    if not arms.travels:
+        return
+    goal, shares = command.copy(), np.empty(len(command))
+    reach, turn = _longest(limits.rise, arms.substeps), _longest(limits.turn_rise, arms.substeps)
+    for k in range(len(command)):
+        shares[k] = _within(before[k, :3], goal[k, :3], 0, limits.reach * reach)
+        _go_share(before[k, :3], goal[k, :3], shares[k], command[k, :3])
+        _go_share(
+            before[k, 3:], goal[k, 3:], _within(before[k, 3:], goal[k, 3:], 3, limits.turn * turn), command[k, 3:]
+        )
+    row, least = command.reshape(1, len(command), EPM_SIZE), limits.gap - GAP_TOLERANCE_M
+    if keeps_gap(row, 0, least):
+        return
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
         for k in range(len(command)):
-            _shorten(before[k, :3], command[k, :3], True, limits.reach * _longest(limits.rise, arms.substeps))
-            _shorten(before[k, 3:], command[k, 3:], False, limits.turn * _longest(limits.turn_rise, arms.substeps))
+            _go_share(before[k, :3], goal[k, :3], middle * shares[k], command[k, :3])
+        low, high = (middle, high) if keeps_gap(row, 0, least) else (low, middle)
+    for k in range(len(command)):
+        _go_share(before[k, :3], goal[k, :3], low * shares[k], command[k, :3])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import wrap
 from magenv.cholesky import add_product, factorise, solve
-from magenv.forecast import STATE, Motion
+from magenv.forecast import STATE, Course
 from magenv.kernels import kernel
 from magenv.sensitivity import COORDINATES, Model, chain, differentiate, go, load_state, place, push, read_state
 
@@ -35,7 +35,7 @@ class Noise(NamedTuple):
 
 @kernel
 def forecast(
-    model: Model, motion: Motion, first: int, last: int, noise: Noise, known: Floats, covariance: Floats
+    model: Model, motion: Course, first: int, last: int, noise: Noise, known: Floats, covariance: Floats
 ) -> None:
     """Carry estimate (18,) and covariance (18, 18) over the substeps ``first`` to ``last`` of a motion, in place."""
     by, drive = np.zeros((STATE, KNOWN)), np.zeros((COORDINATES, KNOWN))

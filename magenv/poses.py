@@ -169,15 +169,21 @@ def command_lanes(lanes: Floats, start: int, count: int, k: int, active: Bools, 
 
 
 @law
-def keep_gap(epms: Floats, row: int, limits: Floats) -> bool:
-    """Project a row of EPMs (n, N, 6), radii within the limits, if centres are too close; return whether they were."""
+def keeps_gap(epms: Floats, row: int, gap: float) -> bool:
+    """Return whether no two centres of a row of EPMs (n, N, 6) are closer than ``gap``."""
     keeps = True
     for k in range(1, epms.shape[1]):
         for j in range(k):
             x, y = epms[row, k, 0] - epms[row, j, 0], epms[row, k, 1] - epms[row, j, 1]
             z = epms[row, k, 2] - epms[row, j, 2]
-            keeps &= x * x + y * y + z * z >= limits[2] * limits[2]
-    return False if keeps else project_epms(epms[row], limits[0], limits[1], limits[2])
+            keeps &= x * x + y * y + z * z >= gap * gap
+    return keeps
+
+
+@law
+def keep_gap(epms: Floats, row: int, limits: Floats) -> bool:
+    """Project a row of EPMs (n, N, 6), radii within the limits, if centres are too close; return whether they were."""
+    return False if keeps_gap(epms, row, limits[2]) else project_epms(epms[row], limits[0], limits[1], limits[2])
 
 
 @law

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.cholesky import add_product
-from magenv.forecast import STATE, Goal, Motion, roll
+from magenv.forecast import STATE, Course, Goal, roll
 from magenv.kernels import kernel
 from magenv.poses import POSE_SIZE
 from magenv.sensitivity import Model
@@ -61,7 +61,7 @@ def lean_on(by: Floats, weights: Floats, doubt: Floats, lean: Floats) -> float:
 def risk(
     model: Model,
     pushing: Floats,
-    motion: Motion,
+    motion: Course,
     goal: Goal,
     start: Floats,
     lean: Floats,

@@ -16,43 +16,34 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.angles import arctan2, sincos
-from magenv.arithmetic import cross2, dot2, dot3
+from magenv.arithmetic import dot2, dot3
 from magenv.dynamics import place_epm
 from magenv.kernels import kernel, law
 from magenv.lanes import ROUTE_SIZE, carried_moment, route
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, project_epms
+from magenv.ways import (
+    Vector,
+    brake,
+    go_way,
+    is_waiting,
+    norm,
+    ramp,
+    read,
+    set_way,
+    stop,
+    stopping,
+    unit,
+    way_round,
+    write,
+)
 
 Floats = NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 _CENTRE, _MOMENT, _GOAL, _GOAL_MOMENT, _NEXT, _RADIUS, _GROWTH, _BEND, _WAY, _TURN = 0, 3, 6, 9, 12, 15, 16, 17, 18, 33
 """Within an EPM's fields: its centre (m) and unit moment, those commanded, its centre at the substep's end; its radius,
 what that grows by in a substep, and by what this changes while the speed does (m); the way of its direction from the
 workspace centre, and that of its moment."""
-_ALONG, _ACROSS, _SINE, _COSINE, _BEND_SINE, _BEND_COSINE, _UP, _FLAT, _DOWN, _NEW, _WHOLE = (
-    0,
-    3,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-)
-"""Within a way, which is fifteen fields: the unit vector that turns, the one at right angles to it towards the goal; of
-the angle by which both turn in a substep, and of that by which it changes; substeps left of rising, constant and
-falling speed; one where a goal waits to be set off for; one where the way ends at its goal."""
-_OPPOSITE = 1e-6
-"""Sine below which two directions count as opposite: any way round is the shortest."""
-_UPRIGHT = 0.9999
-"""Height above which a unit vector has no horizontal one beside it to speak of."""
-_LESS = 1e-9
-"""Part of a substep that is none: more than rounding can be."""
 _ASIDE = 0.25
 """Share of a centre's step by which it steps aside: less than the half that it goes, so that it never stands for it."""
 
@@ -92,164 +83,53 @@ class Motion(NamedTuple):
         return cls(reach, turn, *limits, rise, turn_rise, lag % substeps, lag // substeps)
 
 
-@law
-def _read(lanes: Floats, i: int, at: int) -> Vector:
-    return lanes[at, i], lanes[at + 1, i], lanes[at + 2, i]
-
-
-@law
-def _write(lanes: Floats, i: int, at: int, x: float, y: float, z: float) -> None:
-    lanes[at, i], lanes[at + 1, i], lanes[at + 2, i] = x, y, z
-
-
-@law
-def _norm(x: float, y: float, z: float) -> float:
-    return math.sqrt(dot3(x, y, z, x, y, z))
-
-
-@law
-def _unit(x: float, y: float, z: float) -> Vector:
-    norm = _norm(x, y, z)
-    scale = 1.0 / norm if norm > 0.0 else 0.0
-    return scale * x, scale * y, scale * z
-
-
-@law
-def _cross(u: Vector, v: Vector) -> Vector:
-    return cross2(u[1], u[2], v[1], v[2]), cross2(u[2], u[0], v[2], v[0]), cross2(u[0], u[1], v[0], v[1])
-
-
-@law
-def way_round(u: Vector, v: Vector) -> tuple[float, Vector]:
-    """Return the angle (rad) from unit vector u to v, and the unit vector at right angles to u towards v.
-
-    Where v is opposite, any: one that is horizontal, or in the plane of u and the x axis where u is upright.
-    """
-    axis = _cross(u, v)
-    sine, cosine = _norm(*axis), dot3(*u, *v)
-    if (sine < _OPPOSITE) & (cosine < 0.0):
-        axis = (0.0, 1.0, 0.0) if abs(u[2]) > _UPRIGHT else (0.0, 0.0, 1.0)
-    return arctan2(sine, cosine), _unit(*_cross(axis, u))
-
-
-@kernel
-def ramp(way: float, rise: float) -> tuple[int, int]:
-    """Return the substeps of rising and of constant speed of a move.
-
-    ``way`` is how many substeps at full speed would take, ``rise`` the share of full speed by which it changes in a
-    substep. Speed rises in ``up`` steps, stays for ``flat`` and falls in ``up`` - 1: up (up + flat) first steps.
-    """
-    if way * rise <= 1.0:  # full speed is not reached
-        return max(1, math.ceil(math.sqrt(way / rise) - _LESS)), 0
-    up = max(1, math.ceil(1.0 / rise - _LESS))
-    return up, max(0, math.ceil(way - up - _LESS))
-
-
-@law
-def _set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: float, up: int, flat: int) -> None:
-    """Write the way whose fields begin at ``w``: from unit vector u by ``angle`` (rad)."""
-    _write(lanes, i, w + _ALONG, *u)
-    _write(lanes, i, w + _ACROSS, *across)
-    lanes[w + _BEND_SINE, i], lanes[w + _BEND_COSINE, i] = sincos(angle / (up * (up + flat)))
-    lanes[w + _SINE, i], lanes[w + _COSINE, i] = 0.0, 1.0
-    lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _DOWN, i] = up, flat, up - 1
-    lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 0.0, 1.0
-
-
-@law
-def _left(lanes: Floats, i: int, w: int) -> float:
-    """Return the substeps left of the way whose fields begin at ``w``."""
-    left: float = lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i]
-    return left
-
-
-@law
-def _stopping(lanes: Floats, i: int, w: int) -> float:
-    """Return the substeps that the way whose fields begin at ``w`` goes on for if it brakes from now on."""
-    stopping: float = max(lanes[w + _DOWN, i] - lanes[w + _UP, i], 0.0)
-    return stopping
-
-
-@law
-def _brake(lanes: Floats, i: int, w: int) -> None:
-    """Let the way whose fields begin at ``w`` come to rest; then its goal, perhaps a new one, is set off for."""
-    lanes[w + _DOWN, i] = _stopping(lanes, i, w)
-    lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 0.0, 0.0, 1.0, 0.0
-
-
-@law
-def _go_way(lanes: Floats, i: int, w: int) -> tuple[Vector, float, bool, bool]:
-    """Go a substep on the way whose fields begin at ``w``.
-
-    Returns the unit vector, by how many steps the speed has changed, whether it moves, and whether it is at its goal.
-    """
-    up, flat, down = lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _DOWN, i]
-    moves, there = up + flat + down > 0.0, (up + flat + down == 1.0) & (lanes[w + _WHOLE, i] > 0.0)
-    change = 1.0 if up > 0.0 else (0.0 if flat > 0.0 else -1.0)
-    bend_s = change * lanes[w + _BEND_SINE, i]
-    bend_c = lanes[w + _BEND_COSINE, i] if change != 0.0 else 1.0
-    sine, cosine = lanes[w + _SINE, i], lanes[w + _COSINE, i]
-    sine, cosine = dot2(sine, cosine, bend_c, bend_s), dot2(cosine, -sine, bend_c, bend_s)
-    sine, cosine = (sine if moves else 0.0), (cosine if moves else 1.0)
-    lanes[w + _SINE, i], lanes[w + _COSINE, i] = sine, cosine
-    lanes[w + _UP, i] = max(up - 1.0, 0.0)
-    lanes[w + _FLAT, i] = flat - 1.0 if (up == 0.0) & (flat > 0.0) else flat
-    lanes[w + _DOWN, i] = down - 1.0 if (up + flat == 0.0) & (down > 0.0) else down
-    ux, uy, uz = _read(lanes, i, w + _ALONG)
-    tx, ty, tz = _read(lanes, i, w + _ACROSS)
-    x, y, z = dot2(cosine, sine, ux, tx), dot2(cosine, sine, uy, ty), dot2(cosine, sine, uz, tz)
-    _write(lanes, i, w + _ALONG, x, y, z)
-    _write(lanes, i, w + _ACROSS, dot2(cosine, -sine, tx, ux), dot2(cosine, -sine, ty, uy), dot2(cosine, -sine, tz, uz))
-    return (x, y, z), change, moves, there
-
-
 @kernel
 def _draw_way(lanes: Floats, i: int, e: int, at: int, reach: float, rise: float) -> None:
     """Draw the way of the centre at ``at`` of the EPM whose fields begin at ``e`` to its goal.
 
     No chord of a substep is longer than ``reach`` (m): none is longer than the arc at the largest radius.
     """
-    x, y, z = _read(lanes, i, at)
-    gx, gy, gz = _read(lanes, i, e + _GOAL)
-    radius, goal = _norm(x, y, z), _norm(gx, gy, gz)
+    x, y, z = read(lanes, i, at)
+    gx, gy, gz = read(lanes, i, e + _GOAL)
+    radius, goal = norm(x, y, z), norm(gx, gy, gz)
     u = (x / radius, y / radius, z / radius)
     angle, across = way_round(u, (gx / goal, gy / goal, gz / goal))
     arc, out = max(radius, goal) * angle, goal - radius
     up, flat = ramp(math.sqrt(dot2(arc, out, arc, out)) / reach, rise)
-    _set_way(lanes, i, e + _WAY, u, across, angle, up, flat)
+    set_way(lanes, i, e + _WAY, u, across, angle, up, flat)
     lanes[e + _RADIUS, i], lanes[e + _GROWTH, i], lanes[e + _BEND, i] = radius, 0.0, out / (up * (up + flat))
 
 
 @law
 def _go(lanes: Floats, i: int, e: int) -> None:
     """Write where the centre of the EPM whose fields begin at ``e`` goes, alone, in a substep."""
-    (x, y, z), change, moves, there = _go_way(lanes, i, e + _WAY)
+    (x, y, z), change, moves, there = go_way(lanes, i, e + _WAY)
     growth = lanes[e + _GROWTH, i] + change * lanes[e + _BEND, i]
     radius = lanes[e + _RADIUS, i] + growth
     lanes[e + _GROWTH, i], lanes[e + _RADIUS, i] = growth, radius
-    gx, gy, gz = _read(lanes, i, e + _GOAL)
-    cx, cy, cz = _read(lanes, i, e + _CENTRE)
+    gx, gy, gz = read(lanes, i, e + _GOAL)
+    cx, cy, cz = read(lanes, i, e + _CENTRE)
     x, y, z = (gx if there else radius * x), (gy if there else radius * y), (gz if there else radius * z)
-    _write(lanes, i, e + _NEXT, x if moves else cx, y if moves else cy, z if moves else cz)
+    write(lanes, i, e + _NEXT, x if moves else cx, y if moves else cy, z if moves else cz)
 
 
 @kernel
 def _draw_turn(lanes: Floats, i: int, e: int, turn: float, rise: float) -> None:
     """Draw the way of the moment of the EPM whose fields begin at ``e`` to that commanded, ``turn`` (rad) a substep."""
-    u = _read(lanes, i, e + _MOMENT)
-    angle, across = way_round(u, _read(lanes, i, e + _GOAL_MOMENT))
-    _set_way(lanes, i, e + _TURN, u, across, angle, *ramp(angle / turn, rise))
+    u = read(lanes, i, e + _MOMENT)
+    angle, across = way_round(u, read(lanes, i, e + _GOAL_MOMENT))
+    set_way(lanes, i, e + _TURN, u, across, angle, *ramp(angle / turn, rise))
 
 
 @law
 def _turn(lanes: Floats, i: int, e: int) -> Vector:
     """Turn the moment of the EPM whose fields begin at ``e`` for a substep and return it."""
-    (x, y, z), _, moves, there = _go_way(lanes, i, e + _TURN)
-    gx, gy, gz = _read(lanes, i, e + _GOAL_MOMENT)
-    mx, my, mz = _read(lanes, i, e + _MOMENT)
+    (x, y, z), _, moves, there = go_way(lanes, i, e + _TURN)
+    gx, gy, gz = read(lanes, i, e + _GOAL_MOMENT)
+    mx, my, mz = read(lanes, i, e + _MOMENT)
     x, y, z = (gx if there else x), (gy if there else y), (gz if there else z)
     x, y, z = (x if moves else mx), (y if moves else my), (z if moves else mz)
-    _write(lanes, i, e + _MOMENT, x, y, z)
+    write(lanes, i, e + _MOMENT, x, y, z)
     return x, y, z
 
 
@@ -259,7 +139,7 @@ def is_due(lanes: Floats, i: int, n_epm: int) -> bool:
     due = False
     for k in range(n_epm):
         for w in (route(n_epm, k) + _WAY, route(n_epm, k) + _TURN):
-            due |= (lanes[w + _NEW, i] > 0.0) & (_left(lanes, i, w) == 0.0)
+            due |= is_waiting(lanes, i, w)
     return due
 
 
@@ -268,9 +148,9 @@ def set_off(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
     """Draw the ways that are due in lane ``i``."""
     for k in range(n_epm):
         e = route(n_epm, k)
-        if lanes[e + _WAY + _NEW, i] > 0.0 and _left(lanes, i, e + _WAY) == 0.0:
+        if is_waiting(lanes, i, e + _WAY):
             _draw_way(lanes, i, e, e + _CENTRE, motion.reach, motion.rise)
-        if lanes[e + _TURN + _NEW, i] > 0.0 and _left(lanes, i, e + _TURN) == 0.0:
+        if is_waiting(lanes, i, e + _TURN):
             _draw_turn(lanes, i, e, motion.turn, motion.turn_rise)
 
 
@@ -286,13 +166,13 @@ def command(lanes: Floats, i: int, targets: Floats) -> None:
                 same &= lanes[goal + axis, i] == targets[k, first + axis]
                 lanes[goal + axis, i] = targets[k, first + axis]
             if not same:
-                _brake(lanes, i, w)
+                brake(lanes, i, w)
 
 
 @law
 def _distance2(lanes: Floats, i: int, a: int, b: int) -> float:
     """Return the squared distance of two points of lane ``i`` whose fields begin at ``a`` and ``b``."""
-    (ax, ay, az), (bx, by, bz) = _read(lanes, i, a), _read(lanes, i, b)
+    (ax, ay, az), (bx, by, bz) = read(lanes, i, a), read(lanes, i, b)
     return dot3(bx - ax, by - ay, bz - az, bx - ax, by - ay, bz - az)
 
 
@@ -309,9 +189,9 @@ def go_on(lanes: Floats, i: int, n_epm: int, motion: Motion) -> bool:
         for j in range(k):
             a, b = route(n_epm, j), route(n_epm, k)
             now, then = _distance2(lanes, i, a, b), _distance2(lanes, i, a + _NEXT, b + _NEXT)
-            stopping = 0.5 * max(_stopping(lanes, i, a + _WAY), _stopping(lanes, i, b + _WAY))
+            braking = 0.5 * max(stopping(lanes, i, a + _WAY), stopping(lanes, i, b + _WAY))
             closing = max(math.sqrt(now) - math.sqrt(then), 0.0)
-            near |= math.sqrt(then) - stopping * closing < least
+            near |= math.sqrt(then) - braking * closing < least
     return near
 
 
@@ -319,9 +199,9 @@ def go_on(lanes: Floats, i: int, n_epm: int, motion: Motion) -> bool:
 def _step_aside(a: Floats, b: Floats, gap: float, way: float) -> None:
     """Move two centres that are too close by ``way`` (m) to opposite sides, round each other: else they might stand."""
     nx, ny, nz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    if _norm(nx, ny, nz) < gap:
+    if norm(nx, ny, nz) < gap:
         rx, ry, rz = b[0] + a[0], b[1] + a[1], b[2] + a[2]
-        x, y, z = _unit(ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx)
+        x, y, z = unit(ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx)
         for axis, part in ((0, x), (1, y), (2, z)):
             a[axis] -= way * part
             b[axis] += way * part
@@ -338,12 +218,12 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
     """
     least, slow, close = motion.gap - 2.0 * GAP_TOLERANCE_M, True, False
     for k in range(n_epm):
-        slow &= _stopping(lanes, i, route(n_epm, k) + _WAY) == 0.0
+        slow &= stopping(lanes, i, route(n_epm, k) + _WAY) == 0.0
         for j in range(k):
             close |= _distance2(lanes, i, route(n_epm, j) + _NEXT, route(n_epm, k) + _NEXT) < least * least
     if not slow and not close:
         for k in range(n_epm):
-            _brake(lanes, i, route(n_epm, k) + _WAY)
+            brake(lanes, i, route(n_epm, k) + _WAY)
         return
     centres, waits, creep = np.zeros((n_epm, EPM_SIZE)), not slow, min(motion.rise, 1.0) * motion.reach
     steps = np.empty(n_epm)
@@ -357,14 +237,13 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
             _step_aside(centres[j], centres[k], motion.gap, _ASIDE * max(steps[j], steps[k]))
     project_epms(centres, motion.r_min, motion.r_max, motion.gap)
     for k in range(n_epm):
-        x, y, z = _read(lanes, i, route(n_epm, k) + _CENTRE)
-        waits |= not _norm(centres[k, 0] - x, centres[k, 1] - y, centres[k, 2] - z) <= creep
+        x, y, z = read(lanes, i, route(n_epm, k) + _CENTRE)
+        waits |= not norm(centres[k, 0] - x, centres[k, 1] - y, centres[k, 2] - z) <= creep
     for k in range(n_epm):
         e = route(n_epm, k)
         for axis in range(3):
             lanes[e + _NEXT + axis, i] = lanes[e + _CENTRE + axis, i] if waits else centres[k, axis]
-        _brake(lanes, i, e + _WAY)
-        lanes[e + _WAY + _DOWN, i] = 0.0
+        stop(lanes, i, e + _WAY)
 
 
 @law
@@ -372,10 +251,10 @@ def carry(lanes: Floats, i: int, n_epm: int) -> None:
     """Carry the EPMs of lane ``i`` to where they go; put what acts on the robots where they are halfway."""
     for k in range(n_epm):
         e = route(n_epm, k)
-        x, y, z = _read(lanes, i, e + _CENTRE)
-        p, q, r = _read(lanes, i, e + _NEXT)
-        _write(lanes, i, e + _CENTRE, p, q, r)
-        ux, uy, uz = _read(lanes, i, e + _MOMENT)
+        x, y, z = read(lanes, i, e + _CENTRE)
+        p, q, r = read(lanes, i, e + _NEXT)
+        write(lanes, i, e + _CENTRE, p, q, r)
+        ux, uy, uz = read(lanes, i, e + _MOMENT)
         vx, vy, vz = _turn(lanes, i, e)
         x, y, z = 0.5 * (x + p), 0.5 * (y + q), 0.5 * (z + r)
         ux, uy, uz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from magenv.actions import Actions
 from magenv.dynamics import Physics, constants
-from magenv.forecast import STATE, Goal, Motion, roll
+from magenv.forecast import STATE, Course, Goal, roll
 from magenv.lanes import CONSTANTS, CONSTANTS_SIZE
 from magenv.local import local_basis, shift
 from magenv.params import PLANTS, System
@@ -64,16 +64,16 @@ def shifted(epms: Floats, step: Floats, r_min: float = 1e-3, r_max: float = 1e3)
     return out
 
 
-def held(epms: Floats, substeps: int) -> Motion:
+def held(epms: Floats, substeps: int) -> Course:
     """EPMs (N, 6) that jump there and stay for so many substeps."""
-    motion = Motion.of(len(epms), substeps, False)
+    motion = Course.of(len(epms), substeps, False)
     motion.path[0], motion.by[0, 1] = epms, bases_of(epms)
     return motion
 
 
-def travelling(before: Floats, command: Floats, substeps: int) -> Motion:
+def travelling(before: Floats, command: Floats, substeps: int) -> Course:
     """EPMs on the straight line between two of their places (N, 6), which they reach in the last substep."""
-    motion = Motion.of(len(command), substeps, True)
+    motion = Course.of(len(command), substeps, True)
     first, second = bases_of(before), bases_of(command)
     for j, share in enumerate((1.0 + np.arange(substeps)) / substeps):
         motion.path[j] = (1.0 - share) * before + share * command
@@ -87,7 +87,7 @@ def goal_of(references: Floats, marks: tuple[int, ...], weights: Floats = ONES, 
 
 
 def foreseen(
-    model: Model, state: Floats, pushing: Floats, motion: Motion, goal: Goal, sensitivity: Floats | None = None
+    model: Model, state: Floats, pushing: Floats, motion: Course, goal: Goal, sensitivity: Floats | None = None
 ) -> tuple[Floats, Floats, Floats]:
     """State (12,) at the end of a motion, residuals (12 k,) and, by what ``sensitivity`` holds, their derivatives."""
     by = np.empty((STATE, 0)) if sensitivity is None else sensitivity
@@ -98,7 +98,7 @@ def foreseen(
     return end, residuals, jacobian
 
 
-def end_of(model: Model, state: Floats, pushing: Floats, motion: Motion) -> Floats:
+def end_of(model: Model, state: Floats, pushing: Floats, motion: Course) -> Floats:
     """State (12,) at the end of a motion."""
     goal = goal_of(np.zeros((1, STATE)), (len(motion.which),))
     return foreseen(model, state, pushing, motion, goal)[0]

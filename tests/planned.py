@@ -20,7 +20,7 @@ from foreseen import (
 )
 from scipy.optimize import least_squares
 
-from magenv.forecast import STATE, Goal, Motion
+from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, plan
 from magenv.manoeuvre import Arms
 from magenv.params import Plant, System
@@ -79,7 +79,7 @@ class Task:
         self, commands: Floats, iterations: int = 40, enough: float = 1e-12, scratch: Scratch | None = None
     ) -> float:
         """Improve commands in place; return their cost."""
-        motion, kept = Motion.of(len(self.before), SUBSTEPS, False), (self.state.copy(), self.before.copy())
+        motion, kept = Course.of(len(self.before), SUBSTEPS, False), (self.state.copy(), self.before.copy())
         cost, taken = plan(
             self.model, self.state, PUSH, self.doubt, self.goal, self.arms, motion, self.before, enough, iterations,
             scratch or self.scratch(), commands,

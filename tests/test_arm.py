@@ -16,7 +16,7 @@ from agents.predictive import Predictive
 from agents.rollout import run
 from magenv.env import TwoRobots
 from magenv.episodes import Episodes, Settings
-from magenv.forecast import Motion
+from magenv.forecast import Course
 from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.trajectories import approach
@@ -104,7 +104,7 @@ def test_a_command_given_again_changes_nothing(rng: np.random.Generator) -> None
 def test_the_motion_foreseen_is_the_motion(rng: np.random.Generator) -> None:
     system, substeps = System(), 100
     arms = Arms.of(system, PROMPT, H, substeps)
-    motion, checked = Motion.of(2, substeps, True), 0
+    motion, checked = Course.of(2, substeps, True), 0
     for _ in range(20):
         start, goal = magnets(rng), magnets(rng)
         allow(arms, start, goal)

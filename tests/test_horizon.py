@@ -11,7 +11,7 @@ import pytest
 from foreseen import CERTAIN, NATURAL, Floats, foreseen, held, shifted
 from planned import PUSH, SUBSTEPS, Task
 
-from magenv.forecast import STATE, Motion
+from magenv.forecast import STATE, Course
 from magenv.horizon import land
 from magenv.poses import project_epms
 
@@ -143,7 +143,7 @@ def test_landing_is_the_motion_itself() -> None:
     task = Task.draw(0)
     command = shifted(task.before, np.full(10, 0.05))
     end, errors, _ = foreseen(task.model, task.state, PUSH, held(command, SUBSTEPS), task.goal)
-    state, motion = task.state.copy(), Motion.of(2, SUBSTEPS, False)
+    state, motion = task.state.copy(), Course.of(2, SUBSTEPS, False)
     cost = land(task.model, state, PUSH, task.goal, task.arms, motion, task.before, command)
     np.testing.assert_array_equal(state, end)
     assert cost == pytest.approx(errors @ errors, rel=1e-14)

@@ -10,7 +10,7 @@ from foreseen import CERTAIN, Floats, bases_of, foreseen, shifted
 from lane import magnets
 from planned import PER, PUSH, SUBSTEPS, Task, joint
 
-from magenv.forecast import STATE, Motion
+from magenv.forecast import STATE, Course
 from magenv.horizon import _linearise
 from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, System
@@ -22,9 +22,9 @@ def arms_of(plant: str, n_epm: int, substeps: int) -> Arms:
     return Arms.of(System(n_epm=n_epm), PLANTS[plant], H, substeps)
 
 
-def moved(arms: Arms, before: Floats, command: Floats, substeps: int) -> Motion:
-    """Motion from one command to the next, with its derivatives."""
-    motion = Motion.of(len(command), substeps, True)
+def moved(arms: Arms, before: Floats, command: Floats, substeps: int) -> Course:
+    """Course from one command to the next, with its derivatives."""
+    motion = Course.of(len(command), substeps, True)
     move(arms, before, command, np.stack([bases_of(before), bases_of(command)]), motion, True)
     return motion
 
@@ -54,7 +54,7 @@ def test_derivatives_of_a_way_are_those_by_its_ends(rng: np.random.Generator, pl
 
 def test_what_jumps_is_where_it_is_commanded(rng: np.random.Generator) -> None:
     before, command = magnets(rng), magnets(rng)
-    motion = Motion.of(2, 10, False)
+    motion = Course.of(2, 10, False)
     bases = np.stack([bases_of(before), bases_of(command)])
     move(arms_of("paper", 2, 10), before, command, bases, motion, True)
     np.testing.assert_array_equal(motion.path, command[None])
@@ -62,12 +62,7 @@ def test_what_jumps_is_where_it_is_commanded(rng: np.random.Generator) -> None:
     assert (motion.by[0, 0] == 0.0).all()
 
 
-DRAWN_BACK = pytest.mark.xfail(reason="what is drawn back may come too near to another EPM", strict=True)
-
-
-@pytest.mark.parametrize(
-    "plant", [pytest.param("arm", marks=DRAWN_BACK), pytest.param("moving", marks=DRAWN_BACK), "paper"]
-)
+@pytest.mark.parametrize("plant", ["arm", "moving", "paper"])
 @pytest.mark.parametrize("n_epm", [2, 3])
 def test_what_is_allowed_keeps_radii_and_gap_and_is_allowed_again(
     rng: np.random.Generator, plant: str, n_epm: int
@@ -96,7 +91,7 @@ def test_the_linearisation_where_epms_travel(n_epm: int) -> None:
     for command, step in zip(commands, np.random.default_rng(1).normal(0.0, 0.01, (3, u)), strict=True):
         command[:] = shifted(before, step, 0.15, 0.5)  # near enough to be reached in time
         before = command
-    motion = Motion.of(n_epm, SUBSTEPS, True)
+    motion = Course.of(n_epm, SUBSTEPS, True)
 
     def residuals(commands: Floats) -> Floats:
         state, before, parts = task.state, task.before, []

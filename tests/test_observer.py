@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from foreseen import NATURAL, PAPER, UNMOVED, Floats, at_home, end_of, held, on_the_way, paper_model, uneven_model
 
-from magenv.forecast import STATE, Motion
+from magenv.forecast import STATE, Course
 from magenv.lanes import MOMENT1
 from magenv.observer import KNOWN, Noise, correct, forecast
 from magenv.sensitivity import Model
@@ -35,7 +35,7 @@ def an_estimate(rng: np.random.Generator) -> tuple[Floats, Floats]:
     return known, 0.01 * SIZES[:, None] * (root @ root.T) * SIZES
 
 
-def without_magnets() -> tuple[Model, Motion]:
+def without_magnets() -> tuple[Model, Course]:
     """A plant whose motion is linear: drag and push alone."""
     model = uneven_model(2)
     model.epm_moment[:], model.lane[MOMENT1 : MOMENT1 + 2] = 0.0, 0.0

@@ -206,7 +206,6 @@ def test_where_no_plan_is_found_the_epms_stay(make_env: MakeEnv, monkeypatch: py
     np.testing.assert_allclose(action, last, atol=1e-6)
 
 
-@pytest.mark.xfail(raises=np.linalg.LinAlgError, reason="an estimate that is not finite is kept", strict=True)
 def test_what_could_not_be_foreseen_once_is_over_with_the_next_observation(make_env: MakeEnv) -> None:
     """Robots told to be on the same spot, then where they are."""
     observation, agent = first(make_env(scenario="approach-60"), 0), Predictive()

@@ -7,7 +7,7 @@ import pytest
 from foreseen import CERTAIN, Floats, shifted
 from planned import PUSH, SUBSTEPS, Task, joint
 
-from magenv.forecast import STATE, Motion
+from magenv.forecast import STATE, Course
 from magenv.horizon import Scratch, _backward, _linearise
 from magenv.manoeuvre import Arms
 from magenv.params import Plant, System
@@ -120,7 +120,7 @@ def test_the_linearisation_is_that_of_cost_and_motion(n_epm: int) -> None:
     for command, step in zip(commands, np.random.default_rng(1).normal(0.0, 0.05, (3, u)), strict=True):
         command[:] = shifted(command, step)
     s.states[0] = task.state
-    motion = Motion.of(n_epm, SUBSTEPS, False)
+    motion = Course.of(n_epm, SUBSTEPS, False)
     cost, scale = _linearise(task.model, PUSH, task.goal, task.arms, motion, task.before, CERTAIN, commands, s)
     assert scale == 0.0
     assert cost == pytest.approx(task.cost(commands), rel=1e-12)

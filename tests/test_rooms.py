@@ -55,6 +55,7 @@ ORDER = [
     "trajectories",
     "lanes",
     "dynamics",
+    "ways",
     "travel",
     "sensitivity",
     "local",

@@ -224,4 +224,6 @@ def test_the_solver_is_compiled_once_for_all_who_call_it() -> None:
     one.step(np.zeros(6, np.float32))
     many.reset(seed=0)
     many.step(np.zeros((5, 6), np.float32))
-    assert len(best_of.nopython_signatures) == len(descend.nopython_signatures) == 1  # type: ignore[attr-defined]
+    assert len(best_of.nopython_signatures) == 1  # type: ignore[attr-defined]
+    # none where the machine code of its callers came from the disk: whether it does depends on what ran before
+    assert len(descend.nopython_signatures) <= 1  # type: ignore[attr-defined]
