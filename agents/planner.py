@@ -20,7 +20,7 @@ from magenv.manoeuvre import Arms, move
 from magenv.params import InputError, Plant, System
 from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
 from magenv.sensitivity import COORDINATES, Model
-from magenv.wrench import WRENCH_SIZE, planar_moments
+from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
 
@@ -36,8 +36,6 @@ CONVERGED = 1e-3
 """Cost at which a plan is as good as can be."""
 PARTS = (0.5,)
 """Shares of a command's time for which a plan from elsewhere is made first."""
-PLANAR = (1, 2, 3, 6, 7, 8)
-"""Components of the wrench that the plane does not bear."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ class Planner:
         positions[:, :2] = halfway.reshape(2, 3)[:, :2]
         moments = planar_moments(halfway[2::3], self._system.ipm_moment_am2)
         try:
-            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=PLANAR)
+            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=IN_PLANE)
         except InputError:  # robots on the same spot, or a state that is not finite
             return math.inf, problem.before[None]
         command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]

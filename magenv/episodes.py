@@ -135,7 +135,7 @@ class Episodes:
             routes=w.routes,
             queue=w.queue,
             slow=w.slow,
-            rubs=(plant.disturbance_n, plant.dry_friction_n, plant.dry_friction_nm),
+            rubs=w.rubs,
             uncertain=is_uncertain(plant),
             plant_keys=self._starts.plant_keys,
             plant_key=np.zeros(n, np.uint64),

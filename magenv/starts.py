@@ -12,7 +12,7 @@ from magenv.params import System
 from magenv.poses import POSE_SIZE, home_pose, robots_frame, to_cartesian
 from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_of, trajectory_of
 from magenv.workers import Workers
-from magenv.wrench import WRENCH_SIZE, planar_moments
+from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -52,9 +52,6 @@ def place_rows(
                     before[i, robot, j] = measured[i, robot, j]
 
 
-_PLANAR = (1, 2, 3, 6, 7, 8)
-
-
 def holding_epms(reference: Floats, system: System) -> Floats:
     """Return EPMs (N, 6) that hold nominal robots at rest at a reference (2, 3), as near home as the solver finds them.
 
@@ -72,7 +69,7 @@ def holding_epms(reference: Floats, system: System) -> Floats:
         seed=0,
         initial=home.reshape(-1),
         stop_early=True,
-        components=_PLANAR,
+        components=IN_PLANE,
     )
     return np.concatenate(to_cartesian(held.pose), axis=-1)
 

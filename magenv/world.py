@@ -181,8 +181,8 @@ class World:
         Of a substep, see ``magenv.dynamics.constants``.
     shape : tuple
         Number of EPMs, lanes of the hold, how commands act, whether the plant is rough.
-    routes, queue, slow : ndarray
-        How the EPMs move, commands that do not act yet, what disturbs the robots: see ``hold.hold_rows``.
+    routes, queue, slow, rubs
+        How the EPMs move, commands that do not act yet, what disturbs and rubs the robots: see ``hold.hold_rows``.
     motion : Motion
         Limits of the EPMs' motion.
     held : tuple
@@ -222,6 +222,7 @@ class World:
         late = n if moves != AT_ONCE else 0
         self.queue: Floats = np.zeros((late, 1 + self.motion.wait, system.n_epm, EPM_SIZE))
         self.slow: Floats = np.zeros((n if plant.is_rough else 0, 2, 3))
+        self.rubs = plant.disturbance_n, plant.dry_friction_n, plant.dry_friction_nm
         self.constants: Floats = np.empty((n, CONSTANTS_SIZE))
         constants(self.physics, task.period_s / self.substeps, self.constants)
         self.held = (
@@ -243,7 +244,7 @@ class World:
             self.routes,
             self.queue,
             self.slow,
-            (plant.disturbance_n, plant.dry_friction_n, plant.dry_friction_nm),
+            self.rubs,
         )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:

@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 
 N_ROBOTS = 2
 WRENCH_SIZE = 10
+IN_PLANE = (1, 2, 3, 6, 7, 8)
+"""Components of U that act on robots in the plane: tau_z, F_x, F_y of each; the plane bears the others."""
 
 
 @law

@@ -6,9 +6,10 @@ magenv.crosstalk`` sweeps them all and draws the figures.
 
 from magenv.crosstalk.activation import COMPONENTS, Activations, Pair, activate, crosstalk
 from magenv.crosstalk.frontier import Authority, authority
-from magenv.crosstalk.holdable import IN_PLANE, hold, holdable_separation
+from magenv.crosstalk.holdable import hold, holdable_separation
 from magenv.crosstalk.stability import growth_rates, most_stable_hold, slowest_control_hz
 from magenv.crosstalk.validity import exact_wrench
+from magenv.wrench import IN_PLANE
 
 __all__ = [
     "COMPONENTS",

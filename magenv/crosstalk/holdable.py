@@ -17,8 +17,6 @@ from magenv.wrench import WRENCH_SIZE, robot_frames
 
 Floats = NDArray[np.float64]
 
-IN_PLANE = (1, 2, 3, 6, 7, 8)
-"""Indices into U of what moves robots in their plane: tau_z, F_x, F_y of each. The rest is borne by the plane."""
 HELD = 1e-6
 """Share of the robots' mutual wrench that may be left over in a hold."""
 _FINEST_M = 1e-9

@@ -12,11 +12,12 @@ import numpy as np
 from magenv.allocation import component_scales
 from magenv.crosstalk.activation import Activations, Pair, activate, crosstalk
 from magenv.crosstalk.frontier import authority
-from magenv.crosstalk.holdable import IN_PLANE, holdable_separation
+from magenv.crosstalk.holdable import holdable_separation
 from magenv.crosstalk.stability import most_stable_hold, slowest_control_hz
 from magenv.crosstalk.validity import clear_of_robots, exact_wrench
 from magenv.params import PLANTS, System
 from magenv.poses import to_cartesian
+from magenv.wrench import IN_PLANE
 
 Row = dict[str, Any]
 
