@@ -29,7 +29,7 @@ class EvaluateConfig:
     scenarios: tuple[str, ...] = ("approach-60", "approach-30")
     """approach-<s>, approach-<s>-anti with s in mm, or random."""
     plant: str = "paper"
-    """Plant acted on."""
+    """Plant acted on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
     control_hz: float = 2.0

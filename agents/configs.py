@@ -115,7 +115,7 @@ class TrainConfig:
     scenario: str = "random"
     """Trajectories trained on: random (the seeded family), approach-<s>, approach-<s>-anti."""
     plant: str = "paper"
-    """Plant trained on."""
+    """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
     action: ActionMode = "home"

@@ -20,7 +20,7 @@ from agents.figures import DPI, HOLDABLE_MM, colour_of, png
 from agents.ladder import APART, FILE, LADDER_MM, SURVIVED_RATE, Rung, finished, load, survivable
 from magenv.command import friendly, parse
 from magenv.files import check_output_dir, write_file
-from magenv.params import PLANTS, choose, require
+from magenv.params import plant_named, require
 
 _STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
 """Line and mark of each control rate."""
@@ -99,7 +99,7 @@ def draw(rungs: Sequence[Rung]) -> Figure:
 
 def _limits(axes: Axes, rung: Rung) -> None:
     """Give a panel its axes, and what separations mean on the plant of this rung."""
-    touch_mm = 1e3 * choose(PLANTS, "plant", rung.plant).body.diameter_m
+    touch_mm = 1e3 * plant_named(rung.plant).body.diameter_m
     limit_mm = HOLDABLE_MM["antiparallel" if rung.anti else "parallel"]
     axes.set_xscale("log")
     axes.set_xlim(*_RANGE_MM)

@@ -17,7 +17,7 @@ from agents.planner import ENOUGH, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
 from magenv.observer import KNOWN, Noise, correct, forecast
-from magenv.params import PLANTS, Plant, System, TaskParams, choose, require
+from magenv.params import Plant, System, TaskParams, plant_named, require
 from magenv.poses import POSE_SIZE, from_cartesian
 from magenv.sensitivity import COORDINATES
 from magenv.task import Frame, Layout, ObservationMode, unpack
@@ -99,7 +99,7 @@ class Predictive:
 
     def __init__(self, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper", name: str = "predictive") -> None:
         self.name = name
-        self._system, self._plant = System(n_epm=n_epm), choose(PLANTS, "plant", plant)
+        self._system, self._plant = System(n_epm=n_epm), plant_named(plant)
         self._period_s = period = TaskParams(control_hz=control_hz).period_s
         self._layout = Layout(self._system, self._plant.workspace_radius_m, period, self.observation, self.frame)
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))

@@ -69,7 +69,8 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | | | 180 degrees/s at most, give way to each other, and act on the robots on the way; ``arm``: these moves begin |
     | | | and end at rest (5 m/s^2, 10 rad/s^2), commands act 0.1 s late, noise is 1.3 mm and 1.1 degrees, |
     | | | masses, drags and moments differ by up to 20 % from the nominal ones, anew in each episode; ``low-drag``, |
-    | | | ``high-drag``: ``paper`` at the ends of what drag may be |
+    | | | ``high-drag``: ``paper`` at the ends of what drag may be. Parameters of ``magenv.params.Plant`` may be |
+    | | | changed behind a colon: ``arm:latency_s=0.05,disturbance_n=1e-3`` |
     | ``n_epm`` | 2 | 2 or 3 |
     | ``action`` | ``home`` | see above |
     | ``observation`` | ``full`` | ``full`` or ``errors`` |

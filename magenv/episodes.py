@@ -15,7 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from magenv.actions import ActionMode, Actions
-from magenv.params import PLANTS, InputError, System, TaskParams, choose, is_whole, require
+from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, POSE_SIZE
 from magenv.starts import Starts, holding_epms
 from magenv.state import State, packed
@@ -91,7 +91,7 @@ class Episodes:
 
     def __init__(self, n: int, settings: Settings, threads: int = 1) -> None:
         require(is_whole(settings.n_epm) and settings.n_epm in (2, 3), "n_epm", "2 or 3", settings.n_epm)
-        plant = self.plant = choose(PLANTS, "plant", settings.plant)
+        plant = self.plant = plant_named(settings.plant)
         trajectory = named_trajectory(settings.scenario)
         self.settings = settings
         self.system = System(n_epm=settings.n_epm)

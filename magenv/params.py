@@ -7,9 +7,10 @@ Every value says where it comes from: **paper** (Davy et al. 2023), **literature
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
@@ -283,7 +284,29 @@ class TaskParams:
         return 1.0 / self.control_hz
 
 
-def choose(table: dict[str, Plant], name: str, value: str) -> Plant:
-    """Return ``table[value]`` or raise ``ValueError`` naming the known keys."""
-    require(isinstance(value, str) and value in table, name, "one of " + ", ".join(sorted(table)), value)
-    return table[value]
+def plant_named(text: str) -> Plant:
+    """Return the plant that ``text`` tells: a name, or a name and what differs, as in ``arm:latency_s=0,mismatch=0.1``.
+
+    Raises
+    ------
+    ValueError
+        If there is no such plant or parameter, or a value is no number or out of its range.
+    """
+    known = ", ".join(sorted(PLANTS))
+    require(isinstance(text, str), "plant", f"one of {known}", text)
+    name, colon, changes = text.partition(":")
+    require(name in PLANTS, "plant", f"one of {known}", text)
+    return replace(PLANTS[name], **_changes(text, changes)) if colon else PLANTS[name]
+
+
+def _changes(text: str, changes: str) -> dict[str, Any]:
+    """Return the parameters told by the second part of a plant's text."""
+    known, found = [f.name for f in fields(Plant) if f.type == "float"], dict[str, Any]()
+    for change in changes.split(","):
+        name, _, value = change.partition("=")
+        require(name in known and name not in found, "plant", "changed once in any of " + ", ".join(known), text)
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise InputError(f"Input plant must be changed by numbers; instead received {text!r}.") from None
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from typing import Any
@@ -16,10 +17,12 @@ from rollouts import MODES, MakeEnv
 import magenv
 from magenv.actions import ActionMode
 from magenv.env import TwoRobots
+from magenv.params import Plant
 from magenv.vector_env import TwoRobotsVector
 
 SCENARIOS = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
 CONTROL_HZ = "a number from 0.01 to 1000.0"
+CHANGES = ", ".join(f.name for f in dataclasses.fields(Plant) if f.name != "body")
 
 ARGUMENTS: list[tuple[dict[str, Any], str, str]] = [
     ({"scenario": "approach-5"}, "scenario", SCENARIOS),
@@ -33,6 +36,12 @@ ARGUMENTS: list[tuple[dict[str, Any], str, str]] = [
     ({"scenario": 30}, "scenario", SCENARIOS),
     ({"plant": "swamp"}, "plant", "one of arm, high-drag, low-drag, moving, paper"),
     ({"plant": None}, "plant", "one of arm, high-drag, low-drag, moving, paper"),
+    ({"plant": "swamp:mismatch=0.1"}, "plant", "one of arm, high-drag, low-drag, moving, paper"),
+    ({"plant": "paper:"}, "plant", "changed once in any of " + CHANGES),
+    ({"plant": "paper:body=1"}, "plant", "changed once in any of " + CHANGES),
+    ({"plant": "paper:mismatch=0.1,mismatch=0.2"}, "plant", "changed once in any of " + CHANGES),
+    ({"plant": "paper:mismatch"}, "plant", "changed by numbers"),
+    ({"plant": "paper:mismatch=much"}, "plant", "changed by numbers"),
     ({"n_epm": 0}, "n_epm", "2 or 3"),
     ({"n_epm": 1}, "n_epm", "2 or 3"),
     ({"n_epm": 4}, "n_epm", "2 or 3"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pickle
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 import magenv
 from magenv.actions import ActionMode
 from magenv.env import TwoRobots
-from magenv.params import PLANTS
+from magenv.params import PLANTS, plant_named
 from magenv.task import Frame, ObservationMode
 
 # Contract
@@ -200,3 +201,16 @@ def test_every_registered_plant_runs(make_env: MakeEnv) -> None:
         env = make_env(plant=plant)
         env.reset(seed=0)
         env.step(still(env))
+
+
+def test_plant_with_changed_parameters(make_env: MakeEnv) -> None:
+    """Told behind a colon; nothing else differs from the plant of that name."""
+    changed = plant_named("arm:latency_s=0.05,disturbance_n=1e-3")
+    assert changed == dataclasses.replace(PLANTS["arm"], latency_s=0.05, disturbance_n=1e-3)
+    assert plant_named("arm") is PLANTS["arm"]
+    env = make_env(plant="paper:epm_speed_mps=1,epm_turn_radps=3.141592653589793")
+    twin = make_env(plant="moving")
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    action = np.full_like(still(env), 0.1)
+    np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
