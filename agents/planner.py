@@ -133,7 +133,7 @@ class Planner:
                 state,
                 problem.pushing,
                 np.zeros((STATE, STATE)),
-                goal._replace(references=goal.references[stage:]),
+                goal._replace(references=goal.references[stage:], home=goal.home[stage:]),
                 before,
             )
             found = [self._held_on_the_way(later, rng) for _ in range(LATER_SEARCHES)]

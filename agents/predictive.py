@@ -16,10 +16,11 @@ from agents.controller import RowGenerators
 from agents.planner import ENOUGH, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
-from magenv.observer import KNOWN, Noise, correct, forecast
+from magenv.home import home_epms, start_rows
+from magenv.observer import MOMENTS, Noise, correct, forecast
 from magenv.params import Plant, System, TaskParams, plant_named, require
 from magenv.poses import POSE_SIZE, from_cartesian
-from magenv.sensitivity import COORDINATES
+from magenv.sensitivity import COORDINATES, believe
 from magenv.task import Frame, Layout, ObservationMode, unpack
 
 Floats = NDArray[np.float64]
@@ -32,17 +33,17 @@ POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
 _FLOOR_M, _FLOOR_RAD, _FLOOR_MPS, _FLOOR_RADPS = 3e-6, 3e-6, 1e-5, 3e-5
 _PUSH_N, _PUSH_NM = 3e-5, 3e-8
 
-_DRIFT_N, _DRIFT_NM = 1e-2, 1e-4
-"""By what a push drifts in a second, per mismatch of the parameters: the EPMs move, and with them what is amiss."""
-_AMISS_N, _AMISS_NM = 2e-2, 3e-4
+_DRIFT_N, _DRIFT_NM = 1e-3, 1e-5
+"""By what a push drifts in a second, per mismatch of the parameters."""
+_AMISS_N, _AMISS_NM = 1e-3, 1e-5
 """Push at the beginning, per mismatch."""
 _START_MPS, _START_RADPS = 1e-3, 1e-3
 """Rates that an episode may begin with."""
 
 _LOST = 1.0
 """Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
-_WANDER = 0.0
-"""Weight of a command's change."""
+_PULL = 0.3
+"""Weight of the way from home where the EPMs travel: they do not come back from where they can do little."""
 
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
 """How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
@@ -54,9 +55,9 @@ class Memory:
     """What is remembered of one episode."""
 
     known: Floats
-    """(18,) estimate of the state, and of what pushes."""
+    """(20 + N,) estimate of the state, of what pushes, and of what is amiss with the moments."""
     covariance: Floats
-    """(18, 18)"""
+    """(20 + N, 20 + N)"""
     commands: Floats
     """(H, N, 6) the plan from the present instant on."""
     before: Floats
@@ -105,6 +106,7 @@ class Predictive:
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
         self._stages = min(4, max(1, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
+        self._home = home_epms(n_epm)
         self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
         require(
@@ -158,10 +160,11 @@ class Predictive:
 
     def _begin(self, measured: Floats, epms: Floats) -> Memory:
         """Return the memory of an episode that begins, at rest."""
-        known, covariance = np.zeros(KNOWN), np.zeros((KNOWN, KNOWN))
+        known = np.zeros(MOMENTS + len(epms) + 2)
         known[:COORDINATES] = measured
         unknown = _per_coordinate(_START_MPS, _START_RADPS) ** 2
-        covariance[np.diag_indices(KNOWN)] = np.concatenate([self._noise.measured, unknown, self._pushed])
+        moments = np.full(len(epms) + 2, self._plant.mismatch**2 / 3.0)  # of a uniform distribution
+        covariance = np.diag(np.concatenate([self._noise.measured, unknown, self._pushed, moments]))
         paths = np.repeat(epms[None], 2 * self._substeps, axis=0)
         return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0), epms, paths)
 
@@ -191,7 +194,11 @@ class Predictive:
         share = self._lag / self._substeps  # commands act late, and so do their times end
         states[:-1, :COORDINATES] += share * turn[:3]
         states[:-1, COORDINATES:] += share * np.diff(states[:, COORDINATES:], axis=0)
-        return Goal(np.array([self._substeps]), states[: self._stages, None], self._weights, _WANDER)
+        states = states[: self._stages]
+        home, robots = np.empty((len(states), *self._home.shape)), states[:, :COORDINATES].reshape(-1, 2, 3)
+        start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
+        pull = 0.0 if self._plant.epms_jump else _PULL
+        return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull)
 
     def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
         """Write the best plan found into the memory; return how it was come by."""
@@ -202,8 +209,9 @@ class Predictive:
                 known, covariance = memory.known.copy(), memory.covariance.copy()
         elif self._plant.epms_jump:
             before = epms
+        believe(self._planner.model, known[MOMENTS:])
         doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
-        problem = Problem(known[:STATE].copy(), known[STATE:].copy(), doubt, goal, before)
+        problem = Problem(known[:STATE].copy(), known[STATE:MOMENTS].copy(), doubt, goal, before)
         memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)
         if not math.isfinite(cost):
             memory.commands = np.repeat(before[None], self._stages, axis=0)

@@ -27,8 +27,10 @@ class Goal(NamedTuple):
     """(H, k, 12) states there."""
     weights: Floats
     """(12,) of the errors, per m, rad, m/s, rad/s."""
-    wander: float
-    """Weight of a command's change, per rad and per 0.1 m of radius."""
+    home: Floats
+    """(H, N, 6) EPMs that commands are drawn to."""
+    pull: float
+    """Weight of the way from there, per rad and per 0.1 m of radius."""
 
 
 class Course(NamedTuple):

@@ -1,7 +1,7 @@
 """Planning: the EPM poses whose predicted motion of the robots comes nearest to a reference, over several commands.
 
-The cost is that of weighted errors of pose and rates at marked substeps of each command's time, of the commands'
-changes, and of what is not known of the state at the beginning, grown by the first command. It is minimised by the
+The cost is that of weighted errors of pose and rates at marked substeps of each command's time, of the commands' ways
+from a home, and of what is not known of the state at the beginning, grown by the first command. It is minimised by the
 Gauss-Newton form of differential dynamic programming: derivatives of each command's time, a Riccati recursion
 backwards, and forwards the motion itself under the feedback that the recursion gives, without which errors grow
 through unstable holds beyond all linearity. Radii are kept within their bounds as an active set, the least gap by
@@ -37,7 +37,7 @@ Integers = NDArray[np.int64]
 _STEP_ANGLE, _STEP_RADIUS = 0.5, 0.05
 """Largest change of an angle (rad) and of a radius (m) in an iteration."""
 _PER_RADIUS = 10.0
-"""Weight of a metre of radius, or of the centre's way, in that of a command's change."""
+"""Weight of a metre of the centre's way in that of the way from home."""
 _TRIALS = 10
 _SLOW = 1e-2
 """An iteration that takes off less than this share of the cost is the last."""
@@ -52,7 +52,7 @@ class Scratch(NamedTuple):
     bases: Floats
     """(H + 1, N, 6, 5) of the command before and of each."""
     residuals: Floats
-    """(H, r): errors, then those of the state's doubt, then the command's change."""
+    """(H, r): errors, then those of the state's doubt, then the command's way from home."""
     jacobians: Floats
     """(H, r, z)"""
     by: Floats
@@ -85,22 +85,21 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def _change(
-    command: Floats, before: Floats, bases: Floats, weight: float, residuals: Floats, jacobian: Floats, at: int
+def _away(
+    command: Floats, home: Floats, bases: Floats, weight: float, residuals: Floats, jacobian: Floats, at: int
 ) -> float:
-    """Write what a command's change (N, 6) costs into the residuals from row ``at`` on; return it.
+    """Write what a command's way from home, (N, 6) both, costs into the residuals from row ``at`` on; return it.
 
-    ``bases`` (2, N, 6, 5) are those of the command before and of this one.
+    ``bases`` (N, 6, 5) are those of the command.
     """
     cost, n_epm = 0.0, len(command)
     for k in range(n_epm):
         for a in range(EPM_SIZE):
             w, row = weight * (_PER_RADIUS if a < 3 else 1.0), at + EPM_SIZE * k + a
-            residuals[row] = w * (command[k, a] - before[k, a])
+            residuals[row] = w * (command[k, a] - home[k, a])
             cost += residuals[row] * residuals[row]
             for c in range(POSE_SIZE):
-                jacobian[row, POSE_SIZE * k + c] = -w * bases[0, k, a, c]
-                jacobian[row, POSE_SIZE * (n_epm + k) + STATE + c] = w * bases[1, k, a, c]
+                jacobian[row, POSE_SIZE * (n_epm + k) + STATE + c] = w * bases[k, a, c]
     return cost
 
 
@@ -139,7 +138,8 @@ def _linearise(
             residuals[at : at + STATE], jacobian[at : at + STATE] = 0.0, 0.0
             if scale > 0.0:
                 cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, jacobian, True)
-        cost += _change(commands[stage], old, s.bases[stage : stage + 2], goal.wander, residuals, jacobian, at + STATE)
+        at += STATE
+        cost += _away(commands[stage], goal.home[stage], s.bases[stage + 1], goal.pull, residuals, jacobian, at)
     return cost, scale
 
 
@@ -245,7 +245,7 @@ def _forward(
             cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, s.jacobians[0], False)
         for k in range(n_epm):
             for a in range(EPM_SIZE):
-                cost += (goal.wander * (_PER_RADIUS if a < 3 else 1.0) * (trial[k, a] - old[k, a])) ** 2
+                cost += (goal.pull * (_PER_RADIUS if a < 3 else 1.0) * (trial[k, a] - goal.home[stage, k, a])) ** 2
         if not cost < least:
             return math.inf
     return cost

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.dynamics import Physics, advance, constants, place_epm
+from magenv.dynamics import Physics, advance, constants, place_epm, robots_wrench
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     CONSTANTS,
@@ -46,6 +46,8 @@ class Model(NamedTuple):
     """(fields, 1): the plant's own layout, with the constants of a substep in place."""
     epm_moment: Floats
     """(N,) A m^2."""
+    nominal: Floats
+    """(N + 2,) moments of the EPMs and of the robots as they should be, A m^2."""
     substep: float
     """s."""
     positions: Floats
@@ -67,6 +69,7 @@ class Model(NamedTuple):
         return cls(
             lane,
             np.full(n, system.epm_moment_am2),
+            np.concatenate([np.full(n, system.epm_moment_am2), np.full(2, system.ipm_moment_am2)]),
             substep_s,
             np.zeros((2, 3)),
             np.zeros((2, 3)),
@@ -111,6 +114,16 @@ def place(model: Model, epms: Floats) -> None:
 
 
 @law
+def believe(model: Model, amiss: Floats) -> None:
+    """Let the moments of EPMs and robots be off by these shares (N + 2,) of their nominal ones."""
+    n = len(model.epm_moment)
+    for k in range(n):
+        model.epm_moment[k] = model.nominal[k] * (1.0 + amiss[k])
+    for robot in range(2):
+        model.lane[MOMENT1 + robot, 0] = model.nominal[n + robot] * (1.0 + amiss[n + robot])
+
+
+@law
 def go(model: Model) -> None:
     """Go on by a substep."""
     advance(model.lane, 0, len(model.epm_moment), model.substep, True)
@@ -131,6 +144,29 @@ def differentiate(model: Model, epms: Floats, by_epms: bool) -> None:
         model.positions[robot, 1] = lane[at + 2, 0] + half * lane[at + 8, 0]
         model.moments[robot, 0], model.moments[robot, 1] = moment * math.cos(heading), moment * math.sin(heading)
     planar_kernel(model.positions, model.moments, epms, model.epm_moment, by_epms, model.stiffness, model.gradients)
+
+
+@kernel
+def by_moments(model: Model, epms: Floats, drive: Floats) -> None:
+    """Write the derivatives of the wrench by what ``believe`` takes into the last columns of ``drive`` (6, m).
+
+    After ``differentiate`` by the EPMs (N, 6): the wrench is linear in each moment, and so in what is amiss with it.
+    """
+    n, (p, q), (m1, m2) = len(epms), model.positions, model.moments
+    heading1, heading2 = math.atan2(m1[1], m1[0]), math.atan2(m2[1], m2[0])
+    whole = robots_wrench(model.lane, 0, n, p[0], p[1], heading1, q[0], q[1], heading2)
+    first = drive.shape[1] - n - 2
+    for i in range(COORDINATES):
+        mutual = whole[i]
+        for k in range(n):
+            e, part = 3 + EPM_SIZE * k, 0.0
+            for a in range(3):
+                part += model.gradients[i, e + a] * epms[k, 3 + a]
+            mutual -= part
+            drive[i, first + k] = part * model.nominal[k] / model.epm_moment[k]
+        for robot in range(2):
+            share = model.nominal[n + robot] / model.lane[MOMENT1 + robot, 0]
+            drive[i, first + n + robot] = share * (whole[i] if i // 3 == robot else mutual)
 
 
 @kernel
