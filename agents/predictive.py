@@ -33,7 +33,7 @@ POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
 _FLOOR_M, _FLOOR_RAD, _FLOOR_MPS, _FLOOR_RADPS = 3e-6, 3e-6, 1e-5, 3e-5
 _PUSH_N, _PUSH_NM = 3e-5, 3e-8
 
-_DRIFT_N, _DRIFT_NM = 1e-3, 1e-5
+_DRIFT_N, _DRIFT_NM = 1e-4, 1e-6
 """By what a push drifts in a second, per mismatch of the parameters."""
 _AMISS_N, _AMISS_NM = 1e-3, 1e-5
 """Push at the beginning, per mismatch."""
@@ -44,6 +44,8 @@ _LOST = 1.0
 """Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
 _PULL = 0.3
 """Weight of the way from home where the EPMs travel: they do not come back from where they can do little."""
+_ROOM = 3.0
+"""Weight of EPMs that are too near to each other, there."""
 
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
 """How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
@@ -197,8 +199,8 @@ class Predictive:
         states = states[: self._stages]
         home, robots = np.empty((len(states), *self._home.shape)), states[:, :COORDINATES].reshape(-1, 2, 3)
         start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
-        pull = 0.0 if self._plant.epms_jump else _PULL
-        return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull)
+        pull, room = (0.0, 0.0) if self._plant.epms_jump else (_PULL, _ROOM)
+        return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull, room)
 
     def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
         """Write the best plan found into the memory; return how it was come by."""

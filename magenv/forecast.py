@@ -31,6 +31,8 @@ class Goal(NamedTuple):
     """(H, N, 6) EPMs that commands are drawn to."""
     pull: float
     """Weight of the way from there, per rad and per 0.1 m of radius."""
+    room: float
+    """Weight of EPMs nearer to each other than they should be, per cm."""
 
 
 class Course(NamedTuple):

@@ -38,6 +38,8 @@ _STEP_ANGLE, _STEP_RADIUS = 0.5, 0.05
 """Largest change of an angle (rad) and of a radius (m) in an iteration."""
 _PER_RADIUS = 10.0
 """Weight of a metre of the centre's way in that of the way from home."""
+_ROOM_M = 0.03
+"""By so much more than the least gap should EPMs be apart."""
 _TRIALS = 10
 _SLOW = 1e-2
 """An iteration that takes off less than this share of the cost is the last."""
@@ -65,11 +67,13 @@ class Scratch(NamedTuple):
     """(H + 1, 12)"""
     lean: Floats
     """(12,) what is leant on, see ``risk``."""
+    scrap: Floats
+    """(r, u) for derivatives that nobody reads."""
 
     @classmethod
     def of(cls, stages: int, n_epm: int, marks: int) -> Scratch:
         """Return room for a plan of ``stages`` commands."""
-        u, rows = POSE_SIZE * n_epm, STATE * (marks + 1) + EPM_SIZE * n_epm
+        u, rows = POSE_SIZE * n_epm, STATE * (marks + 1) + EPM_SIZE * n_epm + n_epm * (n_epm - 1) // 2
         y = STATE + u
         return cls(
             np.zeros((stages + 1, STATE)),
@@ -81,6 +85,7 @@ class Scratch(NamedTuple):
             np.zeros((stages, n_epm, EPM_SIZE)),
             np.zeros((stages + 1, STATE)),
             np.zeros(STATE),
+            np.zeros((rows, u)),
         )
 
 
@@ -100,6 +105,32 @@ def _away(
             cost += residuals[row] * residuals[row]
             for c in range(POSE_SIZE):
                 jacobian[row, POSE_SIZE * (n_epm + k) + STATE + c] = w * bases[k, a, c]
+    return cost
+
+
+@kernel
+def _crowd(
+    command: Floats, gap: float, bases: Floats, weight: float, residuals: Floats, jacobian: Floats, at: int
+) -> float:
+    """Write what EPMs (N, 6) that stand hardly farther apart than the least gap cost, from row ``at`` on; return it.
+
+    At the gap they could not go on: commands there are cut off. ``bases`` (N, 6, 5) are those of the command.
+    """
+    cost, n_epm, first = 0.0, len(command), jacobian.shape[1] - POSE_SIZE * len(command)
+    for k in range(n_epm):
+        for other in range(k):
+            p, q = command[k], command[other]
+            x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
+            distance = math.sqrt(dot3(x, y, z, x, y, z))
+            short, row = max(gap + _ROOM_M - distance, 0.0), at + k * (k - 1) // 2 + other
+            w = weight / 0.01 if short > 0.0 else 0.0
+            residuals[row] = w * short
+            cost += residuals[row] * residuals[row]
+            for c in range(3):
+                for which, away in ((k, -w / distance), (other, w / distance)):
+                    b = bases[which]
+                    column = first + POSE_SIZE * which + c
+                    jacobian[row, column] = away * (x * b[0, c] + y * b[1, c] + z * b[2, c])
     return cost
 
 
@@ -140,6 +171,8 @@ def _linearise(
                 cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, jacobian, True)
         at += STATE
         cost += _away(commands[stage], goal.home[stage], s.bases[stage + 1], goal.pull, residuals, jacobian, at)
+        at += EPM_SIZE * len(before)
+        cost += _crowd(commands[stage], arms.limits.gap, s.bases[stage + 1], goal.room, residuals, jacobian, at)
     return cost, scale
 
 
@@ -246,6 +279,7 @@ def _forward(
         for k in range(n_epm):
             for a in range(EPM_SIZE):
                 cost += (goal.pull * (_PER_RADIUS if a < 3 else 1.0) * (trial[k, a] - goal.home[stage, k, a])) ** 2
+        cost += _crowd(trial, arms.limits.gap, s.bases[stage + 1], goal.room, residuals, s.scrap, 0)
         if not cost < least:
             return math.inf
     return cost
