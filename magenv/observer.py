@@ -67,7 +67,7 @@ def forecast(
         row = motion.which[j]
         place(model, motion.path[row])
         differentiate(model, motion.path[row], True)
-        by_moments(model, motion.path[row], drive)
+        by_moments(model, motion.path[row], known[MOMENTS:], drive)
         chain(model, by, drive)
         go(model)
     read_state(model, known)

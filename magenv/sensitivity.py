@@ -147,8 +147,8 @@ def differentiate(model: Model, epms: Floats, by_epms: bool) -> None:
 
 
 @kernel
-def by_moments(model: Model, epms: Floats, drive: Floats) -> None:
-    """Write the derivatives of the wrench by what ``believe`` takes into the last columns of ``drive`` (6, m).
+def by_moments(model: Model, epms: Floats, amiss: Floats, drive: Floats) -> None:
+    """Write the derivatives of the wrench by ``amiss`` (N + 2,), which is believed, into the last columns of ``drive``.
 
     After ``differentiate`` by the EPMs (N, 6): the wrench is linear in each moment, and so in what is amiss with it.
     """
@@ -163,10 +163,10 @@ def by_moments(model: Model, epms: Floats, drive: Floats) -> None:
             for a in range(3):
                 part += model.gradients[i, e + a] * epms[k, 3 + a]
             mutual -= part
-            drive[i, first + k] = part * model.nominal[k] / model.epm_moment[k]
+            drive[i, first + k] = part / (1.0 + amiss[k])
         for robot in range(2):
-            share = model.nominal[n + robot] / model.lane[MOMENT1 + robot, 0]
-            drive[i, first + n + robot] = share * (whole[i] if i // 3 == robot else mutual)
+            depends = whole[i] if i // 3 == robot else mutual
+            drive[i, first + n + robot] = depends / (1.0 + amiss[n + robot])
 
 
 @kernel

@@ -11,7 +11,7 @@ from magenv.forecast import STATE, Course, Goal, roll
 from magenv.lanes import CONSTANTS, CONSTANTS_SIZE
 from magenv.local import local_basis, shift
 from magenv.params import PLANTS, System
-from magenv.sensitivity import Model
+from magenv.sensitivity import Model, believe
 from magenv.trajectories import approach
 
 Floats = NDArray[np.float64]
@@ -40,11 +40,14 @@ def uneven_model(n_epm: int) -> Model:
         (physics.drag_linear, 1.7),
         (physics.drag_rotational, 1.4),
         (physics.ipm_moment, 0.9),
+        (physics.epm_moment, 0.8),
     ):
         values[0, 1] *= factor
     constants(physics, PAPER.substep_s, row)
     model.lane[CONSTANTS : CONSTANTS + CONSTANTS_SIZE, 0] = row
-    model.epm_moment[:] *= np.array([1.1, 0.8, 0.95])[:n_epm]
+    physics.epm_moment[0] *= np.array([1.1, 1.0, 1.2])[:n_epm]
+    model.nominal[:] = np.concatenate([physics.epm_moment[0], physics.ipm_moment[0]])
+    believe(model, np.zeros(n_epm + 2))
     return model
 
 
@@ -81,9 +84,18 @@ def travelling(before: Floats, command: Floats, substeps: int) -> Course:
     return motion
 
 
-def goal_of(references: Floats, marks: tuple[int, ...], weights: Floats = ONES, wander: float = 0.0) -> Goal:
-    """Goal with references (H, k, 12) at marks, or of (H, 12) at a single one."""
-    return Goal(np.array(marks), np.ascontiguousarray(references).reshape(-1, len(marks), STATE), weights, wander)
+def goal_of(
+    references: Floats,
+    marks: tuple[int, ...],
+    weights: Floats = ONES,
+    home: Floats | None = None,
+    pull: float = 0.0,
+    room: float = 0.0,
+) -> Goal:
+    """Goal with references (H, k, 12) at marks, or of (H, 12) at a single one, and one home (N, 6) for all commands."""
+    states = np.ascontiguousarray(references).reshape(-1, len(marks), STATE)
+    homes = np.repeat((np.ones((3, 6)) if home is None else home)[None], len(states), axis=0)
+    return Goal(np.array(marks), states, weights, homes, pull, room)
 
 
 def foreseen(

@@ -28,7 +28,7 @@ from magenv.sensitivity import Model
 
 SUBSTEPS = 20
 PER = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
-"""Weights of an EPM's change, per m of the centre and per unit of the moment."""
+"""Weights of an EPM's way from home, per m of the centre and per unit of the moment."""
 PUSH = np.array([1e-4, -2e-4, 3e-7, 2e-4, 1e-4, -4e-7])
 
 
@@ -44,17 +44,18 @@ class Task:
     doubt: Floats
 
     @classmethod
-    def draw(cls, seed: int, n_epm: int = 2, stages: int = 1, wander: float = 0.1, doubt: float = 0.0) -> Task:
+    def draw(cls, seed: int, n_epm: int = 2, stages: int = 1, pull: float = 0.1, doubt: float = 0.0) -> Task:
         """A goal that other commands near home reach, all but a fifth of a millimetre and what goes with it."""
         rng, system = np.random.default_rng(seed), System(n_epm=n_epm)
         model, weights = uneven_model(n_epm), WEIGHTS * np.repeat([1.0, 0.2], 6)
         state = on_the_way(0.06, rng.uniform(10.0, 90.0)) + 0.3 * rng.normal(size=STATE) * NATURAL
         before, references, end = at_home(state, n_epm), [], state
+        home = shifted(before, rng.normal(0.0, 0.05, 5 * n_epm), 0.15, 0.5)
         for _ in range(stages):
             command = shifted(before, rng.normal(0.0, 0.12, 5 * n_epm) * np.tile([1, 1, 0.1, 1, 1], n_epm), 0.15, 0.5)
             end = end_of(model, end, PUSH, held(command, SUBSTEPS))
             references.append(end + 0.2 * NATURAL * rng.normal(size=STATE))
-        goal = goal_of(np.array(references), (SUBSTEPS,), weights, wander)
+        goal = goal_of(np.array(references), (SUBSTEPS,), weights, home, pull, room=1.0)
         return cls(
             model,
             state,
@@ -90,14 +91,21 @@ class Task:
         return cost
 
     def residuals(self, commands: Floats) -> Floats:
-        """Errors and changes of all commands, the doubt apart."""
-        state, before, parts = self.state, self.before, []
+        """Errors, ways from home and crowding of all commands, the doubt apart."""
+        state, parts = self.state, []
         for stage, command in enumerate(commands):
             goal = self.goal._replace(references=self.goal.references[stage:])
             state, errors, _ = foreseen(self.model, state, PUSH, held(command, SUBSTEPS), goal)
-            parts += [errors, (self.goal.wander * PER * (command - before)).ravel()]
-            before = command
+            parts += [errors, *self.besides(stage, command)]
         return np.concatenate(parts)
+
+    def besides(self, stage: int, command: Floats) -> list[Floats]:
+        """What a command's way from home costs, and that EPMs come near each other."""
+        away = self.goal.pull * PER * (command - self.goal.home[stage])
+        pairs = [(k, i) for k in range(len(command)) for i in range(k)]
+        distances = np.array([np.linalg.norm(command[k, :3] - command[i, :3]) for k, i in pairs])
+        short = np.maximum(self.arms.limits.gap + 0.03 - distances, 0.0)
+        return [away.ravel(), self.goal.room / 0.01 * short]
 
     def cost(self, commands: Floats) -> float:
         return float(np.sum(self.residuals(commands) ** 2))

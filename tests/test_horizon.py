@@ -41,7 +41,7 @@ def test_where_the_last_steps_are_slow_little_is_left(n_epm: int, seed: int) -> 
 @pytest.mark.parametrize("seed", [0, 1, 3, 5])
 def test_near_the_best_one_iteration_is_enough(seed: int, stages: int) -> None:
     """Later commands answer to what earlier ones change: of what a change of all costs, a thousandth is left."""
-    task, rng = Task.draw(seed, 2 + seed % 2, stages, wander=0.3), np.random.default_rng(seed)
+    task, rng = Task.draw(seed, 2 + seed % 2, stages, pull=0.3), np.random.default_rng(seed)
     commands = task.start()
     best = min(task.plan(commands) for _ in range(6))
     steps = rng.normal(0.0, 2e-3, (stages, len(task.before), 5)) * [1.0, 1.0, 0.1, 1.0, 1.0]
@@ -81,7 +81,7 @@ def test_commands_keep_to_radii_and_gap(n_epm: int) -> None:
 def test_a_plan_is_never_worse_than_what_it_was_made_from(n_epm: int, stages: int, iterations: int) -> None:
     for seed in range(20):
         doubt = (0.0, 1e-3, 0.1)[seed % 3]
-        task = Task.draw(seed, n_epm, stages, wander=(0.0, 0.1)[seed % 2], doubt=doubt)
+        task = Task.draw(seed, n_epm, stages, pull=(0.0, 0.1)[seed % 2], doubt=doubt)
         commands = task.start()
         kept = commands.copy()
         before = task.plan(commands, enough=math.inf)
@@ -103,7 +103,7 @@ def growth(task: Task, command: Floats) -> float:
 def test_doubt_makes_plans_that_let_it_grow_less(n_epm: int) -> None:
     """Of a single direction in doubt the risk is the square of its growth, and errors are accepted for it."""
     for seed in range(6):
-        task = Task.draw(seed, n_epm, wander=0.01, doubt=1.0)
+        task = Task.draw(seed, n_epm, pull=0.01, doubt=1.0)
         task.doubt[:, 1:] = 0.0
         certain, doubtful = task.start(), task.start()
         cost = task.plan(doubtful)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from foreseen import CERTAIN, Floats, bases_of, foreseen, shifted
 from lane import magnets
-from planned import PER, PUSH, SUBSTEPS, Task, joint
+from planned import PUSH, SUBSTEPS, Task, joint
 
 from magenv.forecast import STATE, Course
 from magenv.horizon import _linearise
@@ -98,7 +98,7 @@ def test_the_linearisation_where_epms_travel(n_epm: int) -> None:
         for stage, command in enumerate(commands):
             goal = task.goal._replace(references=task.goal.references[stage:])
             state, errors, _ = foreseen(task.model, state, PUSH, moved(task.arms, before, command, SUBSTEPS), goal)
-            parts += [errors, np.zeros(STATE), (task.goal.wander * PER * (command - before)).ravel()]
+            parts += [errors, np.zeros(STATE), *task.besides(stage, command)]
             before = command
         return np.concatenate(parts)
 
