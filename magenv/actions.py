@@ -27,14 +27,13 @@ from magenv.poses import (
     command_lanes,
     epm_to_pose,
     home_pose,
-    keep_gap,
     place_lanes,
     pose_bounds,
     pose_lanes,
     pose_to_epm,
-    project_epms,
     robots_frame,
 )
+from magenv.reach import EVERYWHERE, Shell, make_allowed, project_within
 from magenv.solver import best_of, relative_scale
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
@@ -78,7 +77,7 @@ def pose_rows(
             command_lanes(lanes, start, count, k, active, targets)
         for i in range(start, start + count):
             if active[i]:
-                projected[i] = keep_gap(targets, i, limits)
+                projected[i] = make_allowed(targets, i, limits)
 
 
 @kernel
@@ -110,7 +109,7 @@ def step_rows(
             command_lanes(lanes, start, count, k, active, targets)
         for i in range(start, start + count):
             if active[i]:
-                projected[i] = keep_gap(targets, i, limits)
+                projected[i] = make_allowed(targets, i, limits)
 
 
 @kernel
@@ -179,19 +178,21 @@ def wrench_rows(
         )
         for k in range(n_epm):
             pose_to_epm(best_pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], targets[i, k])
-        projected[i] = project_epms(targets[i], limits[0], limits[1], limits[2])
+        projected[i] = project_within(targets[i], limits)
 
 
 class Actions:
-    """One action mode for a system: turns actions (n, size) into commanded EPMs (n, N, 6)."""
+    """One action mode for a system: turns actions (n, size) into commanded EPMs (n, N, 6) within reach."""
 
-    def __init__(self, mode: ActionMode, system: System, workers: Workers | None = None) -> None:
+    def __init__(
+        self, mode: ActionMode, system: System, workers: Workers | None = None, shell: Shell = EVERYWHERE
+    ) -> None:
         require(mode in get_args(ActionMode), "action", "one of " + ", ".join(get_args(ActionMode)), mode)
         self.mode = mode
         self.size = 6 if mode == "wrench" else POSE_SIZE * system.n_epm
         self._system = system
         self._workers = workers or Workers()
-        self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m])
+        self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m, *shell])
         self._home = home_pose(system.n_epm)
         self.home_epms = home_epms(system.n_epm)
         self._low, self._high = pose_bounds(system)
@@ -227,7 +228,7 @@ class Actions:
     def to_epms(
         self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None
     ) -> tuple[Floats, Bools]:
-        """Return the commanded EPMs (n, N, 6) and where the least gap made them differ from the action.
+        """Return the commanded EPMs (n, N, 6) and where the least gap or reach made them differ from the action.
 
         Parameters
         ----------

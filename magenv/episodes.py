@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode, Actions
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, POSE_SIZE
+from magenv.reach import Shell
 from magenv.starts import Starts, holding_epms
 from magenv.state import State, packed
 from magenv.steps import begin_episodes, clip, step_kernel, tell_rows
@@ -100,7 +101,7 @@ class Episodes:
             self.system, plant.workspace_radius_m, self.task.period_s, settings.observation, settings.frame
         )
         self._workers = Workers(threads)
-        self.actions = Actions(settings.action, self.system, self._workers)
+        self.actions = Actions(settings.action, self.system, self._workers, Shell.of(self.system, plant))
         self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
         bounds = self.layout.bounds()
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
@@ -178,7 +179,7 @@ class Episodes:
         trajectory = named_trajectory(self.settings.scenario)
         if trajectory is None:
             return np.zeros((max(n, 2), self.settings.n_epm, EPM_SIZE))
-        return holding_epms(trajectory.at(0.0), self.system)[None]
+        return holding_epms(trajectory.at(0.0), self.system, self.world.motion.shell)[None]
 
     def _prepare(self) -> None:
         self.packed = packed(self.state)
@@ -201,7 +202,8 @@ class Episodes:
         self._starts.draw(mask, self.world.coefficients, self.world.duration_s)
         if len(self.state.held_epms) > 1:  # each row has a trajectory of its own
             for row in np.flatnonzero(mask).tolist():
-                self.state.held_epms[row] = holding_epms(self.world.trajectory(row).at(0.0), self.system)
+                start = self.world.trajectory(row).at(0.0)
+                self.state.held_epms[row] = holding_epms(start, self.system, self.world.motion.shell)
 
     def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.

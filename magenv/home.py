@@ -15,9 +15,9 @@ from magenv.poses import (
     command_lanes,
     frame_direction,
     home_pose,
-    keep_gap,
     place_lanes,
 )
+from magenv.reach import make_allowed
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -80,7 +80,7 @@ def home_rows(
             command_lanes(lanes, start, count, k, active, targets)
         for i in range(start, start + count):
             if active[i]:
-                projected[i] = keep_gap(targets, i, limits)
+                projected[i] = make_allowed(targets, i, limits)
 
 
 @kernel

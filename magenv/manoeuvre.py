@@ -13,7 +13,8 @@ from magenv.arithmetic import dot3
 from magenv.forecast import Course
 from magenv.kernels import kernel
 from magenv.params import Plant, System
-from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, keeps_gap, project_epms
+from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, keeps_gap
+from magenv.reach import COMMAND_MARGIN_M, narrowed, project_reach, room, shoulder, stays
 from magenv.travel import Motion
 from magenv.ways import ramp, way_round
 
@@ -23,6 +24,8 @@ _LESS = 1.0 - 1e-9
 """A little less than what is allowed: more than rounding can be."""
 _HALVINGS = 30
 """Of the interval in which the greatest share lies by which centres keep the gap."""
+_HALVES = 8
+"""Ways half as far round each that are tried where one would leave the shell."""
 
 
 class Arms(NamedTuple):
@@ -163,18 +166,60 @@ def _go_share(start: Floats, goal: Floats, share: float, out: Floats) -> None:
 
 
 @kernel
+def _bend(limits: Motion, k: int, before: Floats, goal: Floats, most: float) -> None:
+    """Bring the goal of EPM ``k``'s centre, (n, 6) as the places before, to where it can go at once and within reach.
+
+    That is as far round as ``most`` (m) of way allow, or a half of it, a quarter, and so on; and as far out as the way
+    stays within the shell. Where there is no such way it remains where it is.
+    """
+    shell = narrowed(limits.shell, COMMAND_MARGIN_M)
+    base = shoulder(shell, k, len(goal))
+    near, u = _unit(before[k, :3])
+    far, v = _unit(goal[k, :3])
+    angle, t = way_round(u, v)
+    share, low, found = _within(before[k, :3], goal[k, :3], 0, most), near, False
+    for _ in range(_HALVES):
+        turn = share * angle
+        s, c = sincos(turn)
+        w = (c * u[0] + s * t[0], c * u[1] + s * t[1], c * u[2] + s * t[2])
+        high = min(near + share * (far - near), room(shell, base, w, t, 0.0))
+        low = max(limits.r_min, near - _LESS * math.sqrt(max(most * most - (near * turn) ** 2, 0.0)))
+        if low > high:
+            found = False
+        elif stays(shell, base, u, t, turn, near, high, 0.0):
+            low, found = high, True
+        elif stays(shell, base, u, t, turn, near, low, 0.0):
+            found = True
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (low + high)
+                if stays(shell, base, u, t, turn, near, middle, 0.0):
+                    low = middle
+                else:
+                    high = middle
+        if found:
+            break
+        share *= 0.5
+    if found and share == 1.0 and low == far:
+        return
+    for i in range(3):
+        goal[k, i] = before[k, i] if not found else low * w[i]
+
+
+@kernel
 def allow(arms: Arms, before: Floats, command: Floats) -> None:
-    """Make a command (N, 6) one that keeps radii and gap, and where the EPMs travel, one they arrive at in its time.
+    """Make a command (N, 6) one that keeps radii, gap and reach, and where the EPMs travel, is reached in its time.
 
     Centres that are too close where their time is over go less far, all by the same share: before, they were not.
     """
     limits = arms.limits
-    project_epms(command, limits.r_min, limits.r_max, limits.gap)
+    project_reach(command, limits.r_min, limits.r_max, limits.gap, narrowed(limits.shell, COMMAND_MARGIN_M))
     if not arms.travels:
         return
     goal, shares = command.copy(), np.empty(len(command))
     reach, turn = _longest(limits.rise, arms.substeps), _longest(limits.turn_rise, arms.substeps)
     for k in range(len(command)):
+        if limits.shell.outer < math.inf:
+            _bend(limits, k, before, goal, limits.reach * reach)
         shares[k] = _within(before[k, :3], goal[k, :3], 0, limits.reach * reach)
         _go_share(before[k, :3], goal[k, :3], shares[k], command[k, :3])
         _go_share(

@@ -180,6 +180,14 @@ class Plant:
     """Coulomb friction against its rotation, N m."""
     disturbance_n: float = 0.0
     """Amplitude of a slow force on each robot, per axis, N: sinusoids of 20 to 60 s, drawn anew in each episode."""
+    arm_reach_m: float = math.inf
+    """Greatest distance of an EPM's centre from the shoulder of the arm that carries it; infinite, no arm limits it."""
+    arm_reach_min_m: float = 0.41
+    """Least such distance, m: a KUKA LBR iiwa 14 R820, links of 0.42 and 0.4 m, with its elbow bent by 120 degrees."""
+    arm_distance_m: float = 0.47
+    """Of the shoulders from the workspace centre, level; the arms stand evenly round it (ours, as the next)."""
+    arm_height_m: float = 0.45
+    """Of the shoulders above the robots' plane, m: 0.36 m above what the arms stand on (data sheet)."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
@@ -199,6 +207,16 @@ class Plant:
             value, limit = getattr(self, name), limits.get(name, math.inf)
             must_be = "a finite number of at least 0" + ("" if limit == math.inf else f" and at most {limit:g}")
             require(_is_number(value) and 0.0 <= value <= limit, name, must_be, value)
+        reach, least = self.arm_reach_m, self.arm_reach_min_m
+        require(reach == math.inf or (_is_number(reach) and reach > 0.0), "arm_reach_m", "a number above 0", reach)
+        require(
+            _is_number(least) and 0.0 <= least < reach,
+            "arm_reach_min_m",
+            f"a number of at least 0 and below arm_reach_m = {reach:g}",
+            least,
+        )
+        _require_positive(arm_distance_m=self.arm_distance_m)
+        require(_is_number(self.arm_height_m), "arm_height_m", "a finite number", self.arm_height_m)
         require(
             self.workspace_radius_m > self.body.diameter_m,
             "workspace_radius_m",
@@ -242,10 +260,13 @@ PLANTS: dict[str, Plant] = {
         mismatch=0.2,
     ),
 }
+# Data sheet of the LBR iiwa 14 R820: 0.82 m from axis 2 to the wrist, round whose centre the EPM may be turned anyhow.
+PLANTS["arm-reach"] = replace(PLANTS["arm"], arm_reach_m=0.82)
 """The plants by name. ``paper``: EPMs jump to their commanded poses, exact localisation. ``low-drag``,
 ``high-drag``: the same at the ends of what robots' drag may be. ``moving``: as ``paper``, but the EPMs move there at
 finite speed, and act on the robots on the way. ``arm``: they do so with finite acceleration, commands act late,
-measurements are noisy, and the plant's parameters are not quite the nominal ones."""
+measurements are noisy, and the plant's parameters are not quite the nominal ones. ``arm-reach``: nor do the arms reach
+everywhere."""
 
 
 CONTROL_HZ_RANGE = (0.01, 1000.0)

@@ -181,12 +181,6 @@ def keeps_gap(epms: Floats, row: int, gap: float) -> bool:
 
 
 @law
-def keep_gap(epms: Floats, row: int, limits: Floats) -> bool:
-    """Project a row of EPMs (n, N, 6), radii within the limits, if centres are too close; return whether they were."""
-    return False if keeps_gap(epms, row, limits[2]) else project_epms(epms[row], limits[0], limits[1], limits[2])
-
-
-@law
 def frame_direction(s1: float, c1: float, s2: float, c2: float) -> tuple[float, float]:
     """Return the direction (cosine, sine) of the frame the robots carry: along h1 + 0.8 h2, of headings (s, c).
 

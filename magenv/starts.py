@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from magenv.allocation import allocate
 from magenv.kernels import kernel
-from magenv.params import System
+from magenv.params import System, require
 from magenv.poses import POSE_SIZE, home_pose, robots_frame, to_cartesian
+from magenv.reach import COMMAND_MARGIN_M, Shell, beyond_reach, narrowed
 from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_of, trajectory_of
 from magenv.workers import Workers
 from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
@@ -19,6 +22,10 @@ Bools = NDArray[np.bool_]
 
 _AHEAD = 32
 """Episodes for which a row draws at a time, whatever the size of the batch: it is part of what a seed means."""
+_TURNS = 100
+"""Searches for poses within reach that hold the robots."""
+_FARTHEST = np.array([1.0, 1.0, 0.1, 1.0, 1.0])
+"""Standard deviation of the last one's start from home, per coordinate of a pose."""
 
 
 @kernel
@@ -52,26 +59,39 @@ def place_rows(
                     before[i, robot, j] = measured[i, robot, j]
 
 
-def holding_epms(reference: Floats, system: System) -> Floats:
+def holding_epms(reference: Floats, system: System, shell: Shell) -> Floats:
     """Return EPMs (N, 6) that hold nominal robots at rest at a reference (2, 3), as near home as the solver finds them.
 
-    Where commands act late the robots would be gone before the first one, if the EPMs stood at home.
+    Where commands act late the robots would be gone before the first one, if the EPMs stood at home. Poses out of reach
+    are sought anew from farther and farther away from home.
+
+    Raises
+    ------
+    ValueError
+        If none within reach are found.
     """
     positions = np.zeros((2, 3))
     positions[:, :2] = reference[:, :2]
     home = home_pose(system.n_epm).reshape(-1, POSE_SIZE)
     home[:, [0, 3]] += robots_frame(reference[0, 2], reference[1, 2])
-    held = allocate(
-        np.zeros(WRENCH_SIZE),
-        positions,
-        planar_moments(reference[:, 2], system.ipm_moment_am2),
-        system,
-        seed=0,
-        initial=home.reshape(-1),
-        stop_early=True,
-        components=IN_PLANE,
-    )
-    return np.concatenate(to_cartesian(held.pose), axis=-1)
+    rng, within = np.random.default_rng(0), narrowed(shell, COMMAND_MARGIN_M)
+    for turn in range(_TURNS):
+        held = allocate(
+            np.zeros(WRENCH_SIZE),
+            positions,
+            planar_moments(reference[:, 2], system.ipm_moment_am2),
+            system,
+            seed=0,
+            initial=(home + turn / _TURNS * _FARTHEST * rng.normal(size=home.shape)).reshape(-1),
+            stop_early=True,
+            components=IN_PLANE,
+        )
+        epms = np.concatenate(to_cartesian(held.pose), axis=-1)
+        found = shell.outer == math.inf or (held.status == "converged" and beyond_reach(epms, within, False) == 0.0)
+        if found:
+            break
+    require(found, "arm_reach_m", "so large that EPMs within reach hold the robots at the start", shell.outer)
+    return epms
 
 
 class Starts:

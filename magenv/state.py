@@ -76,14 +76,14 @@ class State(NamedTuple):
     targets: Floats
     """(n, N, 6) commanded EPMs."""
     projected: Bools
-    """(n,) whether the least gap made them differ from the action."""
+    """(n,) whether the least gap or reach made them differ from the action."""
     home: Floats
     """(5 N,) pose at home."""
     low: Floats
     """(5 N,) bounds of poses."""
     high: Floats
     limits: Floats
-    """(3,) least and greatest radius, least gap, m."""
+    """(7,) least and greatest radius, least gap, shell of the arms, m: see ``reach.make_allowed``."""
     wrench_starts: Floats
     """(k, 5 N) starts of the allocation."""
     wrench_scale: Floats

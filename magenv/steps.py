@@ -17,6 +17,7 @@ from magenv.dynamics import Physics
 from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel, typed
+from magenv.reach import make_allowed
 from magenv.starts import place_rows
 from magenv.state import State
 from magenv.task import observe_rows, reward_terms
@@ -156,6 +157,11 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
         s.before,
     )
     start_rows(first, last, mask, s.measured, s.home_epms, s.epms)
+    if s.limits[4] < math.inf:
+        epms, limits = s.epms, s.limits
+        for i in range(first, last):
+            if mask[i]:
+                make_allowed(epms, i, limits)
     if len(s.held_epms) > 0:
         epms, held = s.epms, s.held_epms
         for i in range(first, last):

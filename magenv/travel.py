@@ -5,7 +5,8 @@ that it comes no nearer than the nearer end; its moment turns the shortest way. 
 rises evenly, stays, and falls evenly; the centre has its full speed where its radius is largest. A command that comes
 during a move lets the EPM brake on its way, then set off anew. What the EPMs do to the robots in a substep is what they
 do halfway. Where two centres would come closer than the least gap they brake, creep, are moved apart as commands are,
-and step aside, always to the same side.
+and step aside, always to the same side. Where the way would leave the shell within an arm's reach it is gone in parts,
+from rest to rest: along the radius to where the whole way round is within reach, round, and along the radius again.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from magenv.dynamics import place_epm
 from magenv.kernels import kernel, law
 from magenv.lanes import ROUTE_SIZE, carried_moment, route
 from magenv.params import Plant, System
-from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, project_epms
+from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M
+from magenv.reach import REACH_TOLERANCE_M, Shell, project_reach, room, shoulder, stays
 from magenv.ways import (
     Vector,
     brake,
     go_way,
+    goes_on,
     is_waiting,
     norm,
     ramp,
@@ -69,6 +72,8 @@ class Motion(NamedTuple):
     """Substeps of a hold after which a command acts,"""
     wait: int
     """so many holds after its own."""
+    shell: Shell
+    """Within the arms' reach."""
 
     @classmethod
     def of(cls, system: System, plant: Plant, substep_s: float, substeps: int) -> Motion:
@@ -80,23 +85,33 @@ class Motion(NamedTuple):
         )
         lag = round(plant.latency_s / substep_s)
         limits = (system.r_min_m, system.r_max_m, system.gap_min_m)
-        return cls(reach, turn, *limits, rise, turn_rise, lag % substeps, lag // substeps)
+        return cls(reach, turn, *limits, rise, turn_rise, lag % substeps, lag // substeps, Shell.of(system, plant))
 
 
 @kernel
-def _draw_way(lanes: Floats, i: int, e: int, at: int, reach: float, rise: float) -> None:
-    """Draw the way of the centre at ``at`` of the EPM whose fields begin at ``e`` to its goal.
+def _draw_way(lanes: Floats, i: int, n_epm: int, k: int, motion: Motion) -> None:
+    """Draw the way of the ``k``-th EPM's centre to its goal, or the first part of it.
 
-    No chord of a substep is longer than ``reach`` (m): none is longer than the arc at the largest radius.
+    No chord of a substep is longer than what the centre moves at most: none is longer than the arc at the largest
+    radius.
     """
-    x, y, z = read(lanes, i, at)
+    e, whole = route(n_epm, k), True
+    x, y, z = read(lanes, i, e + _CENTRE)
     gx, gy, gz = read(lanes, i, e + _GOAL)
     radius, goal = norm(x, y, z), norm(gx, gy, gz)
     u = (x / radius, y / radius, z / radius)
     angle, across = way_round(u, (gx / goal, gy / goal, gz / goal))
+    if motion.shell.outer < math.inf:
+        base = shoulder(motion.shell, k, n_epm)
+        whole = stays(motion.shell, base, u, across, angle, radius, goal, REACH_TOLERANCE_M)
+        if not whole:
+            most = room(motion.shell, base, u, across, angle)
+            angle, goal = (0.0, most) if radius > most + GAP_TOLERANCE_M else (angle, min(goal, most))
     arc, out = max(radius, goal) * angle, goal - radius
-    up, flat = ramp(math.sqrt(dot2(arc, out, arc, out)) / reach, rise)
+    up, flat = ramp(math.sqrt(dot2(arc, out, arc, out)) / motion.reach, motion.rise)
     set_way(lanes, i, e + _WAY, u, across, angle, up, flat)
+    if not whole:
+        goes_on(lanes, i, e + _WAY)
     lanes[e + _RADIUS, i], lanes[e + _GROWTH, i], lanes[e + _BEND, i] = radius, 0.0, out / (up * (up + flat))
 
 
@@ -149,7 +164,7 @@ def set_off(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
     for k in range(n_epm):
         e = route(n_epm, k)
         if is_waiting(lanes, i, e + _WAY):
-            _draw_way(lanes, i, e, e + _CENTRE, motion.reach, motion.rise)
+            _draw_way(lanes, i, n_epm, k, motion)
         if is_waiting(lanes, i, e + _TURN):
             _draw_turn(lanes, i, e, motion.turn, motion.turn_rise)
 
@@ -235,7 +250,7 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
     for k in range(1, n_epm):
         for j in range(k):
             _step_aside(centres[j], centres[k], motion.gap, _ASIDE * max(steps[j], steps[k]))
-    project_epms(centres, motion.r_min, motion.r_max, motion.gap)
+    project_reach(centres, motion.r_min, motion.r_max, motion.gap, motion.shell)
     for k in range(n_epm):
         x, y, z = read(lanes, i, route(n_epm, k) + _CENTRE)
         waits |= not norm(centres[k, 0] - x, centres[k, 1] - y, centres[k, 2] - z) <= creep

@@ -99,6 +99,12 @@ def set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: flo
 
 
 @law
+def goes_on(lanes: Floats, i: int, w: int) -> None:
+    """Make the way whose fields begin at ``w`` part of a longer one: at its end its goal is set off for anew."""
+    lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 1.0, 0.0
+
+
+@law
 def stopping(lanes: Floats, i: int, w: int) -> float:
     """Return the substeps that the way whose fields begin at ``w`` goes on for if it brakes from now on."""
     stopping: float = max(lanes[w + _DOWN, i] - lanes[w + _UP, i], 0.0)
@@ -109,7 +115,8 @@ def stopping(lanes: Floats, i: int, w: int) -> float:
 def brake(lanes: Floats, i: int, w: int) -> None:
     """Let the way whose fields begin at ``w`` come to rest; then its goal, perhaps a new one, is set off for."""
     lanes[w + _DOWN, i] = stopping(lanes, i, w)
-    lanes[w + _UP, i], lanes[w + _FLAT, i], lanes[w + _NEW, i], lanes[w + _WHOLE, i] = 0.0, 0.0, 1.0, 0.0
+    lanes[w + _UP, i], lanes[w + _FLAT, i] = 0.0, 0.0
+    goes_on(lanes, i, w)
 
 
 @law

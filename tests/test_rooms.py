@@ -56,6 +56,7 @@ ORDER = [
     "lanes",
     "dynamics",
     "ways",
+    "reach",
     "travel",
     "sensitivity",
     "local",
