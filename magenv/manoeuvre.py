@@ -20,8 +20,8 @@ from magenv.ways import ramp, way_round
 
 Floats = NDArray[np.float64]
 
-_LESS = 1.0 - 1e-9
-"""A little less than what is allowed: more than rounding can be."""
+_LESS = 1.0 - 1e-4
+"""A little less than what is allowed: more than rounding to an action can be, for which a way takes longer."""
 _HALVINGS = 30
 """Of the interval in which the greatest share lies by which centres keep the gap."""
 _HALVES = 8

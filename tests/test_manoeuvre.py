@@ -10,10 +10,12 @@ from foreseen import CERTAIN, Floats, bases_of, foreseen, shifted
 from lane import magnets
 from planned import PUSH, SUBSTEPS, Task, joint
 
+from magenv.actions import Actions, pose_to_action
 from magenv.forecast import STATE, Course
 from magenv.horizon import _linearise
 from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, System
+from magenv.poses import from_cartesian
 
 H = 0.005
 
@@ -79,6 +81,17 @@ def test_what_is_allowed_keeps_radii_and_gap_and_is_allowed_again(
         np.testing.assert_allclose(np.linalg.norm(command[:, 3:], axis=1), 1.0, rtol=1e-12)
         allow(arms, before, command)
         np.testing.assert_allclose(command, once, atol=1e-9)
+
+
+def test_what_is_allowed_arrives_in_time_as_it_is_told(rng: np.random.Generator) -> None:
+    """Rounded to an action; a way that is longer by that much would take one substep more, and another course."""
+    system, arms, actions = System(), arms_of("arm", 2, 20), Actions("pose", System())
+    for _ in range(50):
+        before, command = magnets(rng, system), magnets(rng, system)
+        allow(arms, before, command)
+        action = pose_to_action(from_cartesian(command[:, :3], command[:, 3:]), system).astype(np.float64)
+        acting = actions.to_epms(action[None], np.zeros((1, 2, 3)), before[None])[0][0]
+        np.testing.assert_allclose(moved(arms, before, acting, 20).path[-1], acting, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])
