@@ -16,7 +16,7 @@ from magenv.actions import planar_target
 from magenv.allocation import allocate
 from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, land, plan
-from magenv.manoeuvre import Arms, move
+from magenv.manoeuvre import Arms, allow, move
 from magenv.params import InputError, Plant, System
 from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
 from magenv.sensitivity import COORDINATES, Model
@@ -155,6 +155,7 @@ class Planner:
         except InputError:  # robots on the same spot, or a state that is not finite
             return math.inf, problem.before[None]
         command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
+        allow(self._arms, problem.before, command[0])  # what holds may be out of the arms' reach
         none, cost = np.zeros((STATE, STATE)), math.inf
         for motion in (*self._parts, self._motion):
             whole = motion is self._motion

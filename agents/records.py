@@ -61,7 +61,7 @@ class Record:
     substeps: NDArray[np.int64]
     """(K,) substeps of the hold: fewer where control was lost in it."""
     projected: NDArray[np.bool_]
-    """(K,) whether the command's EPMs were too close and were moved apart."""
+    """(K,) whether the command's EPMs were too close, or out of reach, and were moved."""
     step_ms: Floats
     """(K,) wall time of ``predict``."""
 
