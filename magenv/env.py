@@ -40,8 +40,8 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Wrenches are turned into poses by ``magenv.allocation``.
 
-    EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart;
-    ``info["projected"]`` says so.
+    EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart, those that
+    would be out of their arms' reach are moved within it; ``info["projected"]`` says so.
 
     ## Observation space
     ``Box(float32)``, finite bounds: pose errors first, then what makes the task Markov; the table is in
@@ -68,9 +68,10 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | ``plant`` | ``paper`` | EPMs jump to their commanded poses, no noise; ``moving``: they go there at 1 m/s and |
     | | | 180 degrees/s at most, give way to each other, and act on the robots on the way; ``arm``: these moves begin |
     | | | and end at rest (5 m/s^2, 10 rad/s^2), commands act 0.1 s late, noise is 1.3 mm and 1.1 degrees, |
-    | | | masses, drags and moments differ by up to 20 % from the nominal ones, anew in each episode; ``low-drag``, |
-    | | | ``high-drag``: ``paper`` at the ends of what drag may be. Parameters of ``magenv.params.Plant`` may be |
-    | | | changed behind a colon: ``arm:latency_s=0.05,disturbance_n=1e-3`` |
+    | | | masses, drags and moments differ by up to 20 % from the nominal ones, anew in each episode; |
+    | | | ``arm-reach``: ``arm``, each EPM within 0.41 to 0.82 m of a shoulder of its own beside the workspace, all |
+    | | | the way; ``low-drag``, ``high-drag``: ``paper`` at the ends of what drag may be. Parameters of |
+    | | | ``magenv.params.Plant`` may be changed behind a colon: ``arm:latency_s=0.05,disturbance_n=1e-3`` |
     | ``n_epm`` | 2 | 2 or 3 |
     | ``action`` | ``home`` | see above |
     | ``observation`` | ``full`` | ``full`` or ``errors`` |
