@@ -243,9 +243,9 @@ def test_room_is_the_greatest_radius_all_the_way_round(rng: np.random.Generator)
     for u, across, angle, _, turned in arcs(rng, 200):
         radius = room(SHELL, base, u, across, angle)
         distances = np.linalg.norm(radius * turned - base, axis=-1)
-        least = np.linspace(0.15, radius, 20)[:, None, None] * turned
-        assert np.linalg.norm(least - base, axis=-1).max() <= SHELL.outer + 1e-12
-        assert np.linalg.norm(least - base, axis=-1).min() >= SHELL.inner - 1e-12
+        inside = np.linspace(0.15, radius, 20)[:, None, None] * turned
+        assert np.linalg.norm(inside - base, axis=-1).max() <= SHELL.outer + 1e-12
+        assert np.linalg.norm(inside - base, axis=-1).min() >= SHELL.inner - 1e-12
         assert min(SHELL.outer - distances.max(), distances.min() - SHELL.inner) < 1e-5  # between samples it touches
 
 
@@ -312,8 +312,7 @@ def test_every_goal_within_reach_is_reached_with_the_acceleration_of_the_arm(rng
     np.testing.assert_array_equal(way[-1][~near], draws[-1][~near])
     speed = np.linalg.norm(np.diff(centres[:, ~near], axis=0), axis=-1) / H
     changes = np.abs(np.diff(speed, axis=0)) / H
-    # Radius r and angle a go in step: the speed in space, at an angle p to the radius, changes by v^2 cos p sin^2 p / r
-    # besides; the last step of a way is as long as it has to be.
+    # Radius and angle go in step: in space, at angle p to the radius r, speed v changes by v^2 cos p sin^2 p / r too.
     assert changes.max() < 1.01 * PLANT.epm_acceleration_mps2 + 0.385 * PLANT.epm_speed_mps**2 / system.r_min_m
     rests = (speed[1:-1] < speed[:-2]) & (speed[1:-1] < speed[2:]) & (speed[1:-1] < 2 * PLANT.epm_acceleration_mps2 * H)
     assert rests.any(axis=0).mean() > 0.2
@@ -360,8 +359,8 @@ def test_what_is_allowed_is_within_reach_all_the_way_as_foreseen(rng: np.random.
             path.append(world.epms.copy())
         seen = 0.5 * (np.array(path[1:]) + np.array(path[:-1]))
         np.testing.assert_allclose(seen[:, roomy], foreseen[:, roomy], rtol=0, atol=1e-5)
-        touched += int((np.abs(away(commands[..., :3]) - [SHELL.inner, SHELL.outer][:1] - 1e-5) < 1e-6).sum())
-        touched += int((np.abs(away(commands[..., :3]) - SHELL.outer + 1e-5) < 1e-6).sum())
+        spare = np.minimum(away(commands[..., :3]) - SHELL.inner, SHELL.outer - away(commands[..., :3]))
+        touched += int((spare < 1.1e-5).sum())
         gone += float(np.linalg.norm(commands[..., :3] - before[..., :3], axis=-1).mean())
         world.epms[:] = commands  # the next begins where this one ends, without what it was rounded by
         before = commands
