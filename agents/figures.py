@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.metrics import by_controller, typical
 from agents.records import Record
-from magenv.params import PLANTS
+from magenv.params import plant_named
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def paths(records: list[Record]) -> Figure:
     columns = min(3, len(groups)) if len(groups) != 4 else 2
     rows = math.ceil(len(groups) / columns)
     figure = _figure(0.6 + 4.2 * columns, 1.0 + 4.3 * rows)
-    wall_mm = 1e3 * PLANTS[records[0].plant].workspace_radius_m
+    wall_mm = 1e3 * plant_named(records[0].plant).workspace_radius_m
     for index, (name, episodes) in enumerate(groups.items()):
         axes = figure.add_subplot(rows, columns, index + 1)
         colour = colour_of(name, list(groups))
@@ -144,7 +144,7 @@ def separation(records: list[Record]) -> Figure:
     reference = records[0].reference
     axes.plot(np.arange(len(reference)) / records[0].control_hz, 1e3 * _distance(reference), color=_INK, linestyle="--")
     turned = "antiparallel" if records[0].scenario.endswith("-anti") else "parallel"
-    touch_mm = 1e3 * PLANTS[records[0].plant].body.diameter_m
+    touch_mm = 1e3 * plant_named(records[0].plant).body.diameter_m
     axes.axhline(HOLDABLE_MM[turned], color="#777777", linestyle="-.", linewidth=1.2)
     axes.axhspan(0.0, touch_mm, color="#CCCCCC", linewidth=0)
     axes.set_ylim(bottom=0.0)

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from agents.metrics import by_controller, typical
 from agents.records import Record
-from magenv.params import PLANTS, System
+from magenv.params import System, plant_named
 from magenv.poses import to_cartesian
 from magenv.render import Renderer
 from magenv.scene import Scene
@@ -66,7 +66,7 @@ class _Show:
 
     def __init__(self, record: Record) -> None:
         self._record = record
-        self._renderer = Renderer(System(n_epm=record.n_epm), PLANTS[record.plant], window=False)
+        self._renderer = Renderer(System(n_epm=record.n_epm), plant_named(record.plant), window=False)
         self._centres, self._directions = to_cartesian(record.epm_pose)
         self._font = ImageFont.load_default(size=18)
         self._at = -1
