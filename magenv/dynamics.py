@@ -12,21 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.angles import sincos
-from magenv.arithmetic import cross2, dot2, fma
-from magenv.dipole import SOURCE, dipole_parts
+from magenv.arithmetic import dot2, fma
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     DECAY1,
     DECAY2,
-    EPMS,
     FRICTION,
     GAIN1,
     GAIN2,
     HEADING1,
     HEADING2,
-    MOMENT1,
-    MOMENT2,
     PUSH_TURN1,
     PUSH_TURN2,
     PUSH_X1,
@@ -49,8 +44,8 @@ from magenv.lanes import (
     Y1,
     Y2,
 )
+from magenv.magnets import Size, robots_wrench
 from magenv.params import Plant, System
-from magenv.poses import EPM_SIZE
 
 Floats = NDArray[np.float64]
 
@@ -77,6 +72,8 @@ class Physics(NamedTuple):
     """(n, 2) A m^2."""
     epm_moment: Floats
     """(n, N) A m^2."""
+    epm_size: Size
+    """See ``magnets``."""
     body_diameter: float
     """m."""
     wall_radius: float
@@ -85,7 +82,7 @@ class Physics(NamedTuple):
     @classmethod
     def of(cls, system: System, plant: Plant, n: int) -> Physics:
         """Return ``n`` equal rows of the parameters of ``system`` and ``plant``."""
-        body = plant.body
+        body, epm = plant.body, system.epm
         return cls(
             mass=np.full((n, 2), body.mass_kg),
             inertia=np.full((n, 2), body.inertia_kgm2),
@@ -93,105 +90,13 @@ class Physics(NamedTuple):
             drag_rotational=np.full((n, 2), body.drag_rotational_nmsprad),
             ipm_moment=np.full((n, 2), system.ipm_moment_am2),
             epm_moment=np.full((n, system.n_epm), system.epm_moment_am2),
+            epm_size=(epm.diameter_m, epm.length_m) if plant.epm_cylinders else None,
             body_diameter=body.diameter_m,
             wall_radius=plant.workspace_radius_m,
         )
 
 
 Pair = tuple[float, float]
-PlanarSums = tuple[float, float, float, float, float]
-"""What sources do to a robot in the plane: B_x, B_y (T), force per moment along it (T/m), F_x, F_y of the rest (N)."""
-
-
-@law
-def add_source(
-    sums: PlanarSums,
-    sx: float,
-    sy: float,
-    s_height: float,
-    nx: float,
-    ny: float,
-    rx: float,
-    ry: float,
-    height2: float,
-) -> PlanarSums:
-    """Return the sums with a source's share added, for a moment n in the plane at the offset (rx, ry) in the plane.
-
-    (sx, sy) is the source's strength (see ``dipole.SOURCE``) in the plane. ``height2`` is the square of the source's
-    height and ``s_height`` minus the height times the strength's z component: all that enters of what is out of plane.
-    """
-    bx, by, along, fx, fy = sums
-    r2, s_r, n_r = fma(rx, rx, fma(ry, ry, height2)), fma(sx, rx, fma(sy, ry, s_height)), dot2(nx, ny, rx, ry)
-    k, on_n, on_s, on_r = dipole_parts(r2, s_r, n_r, dot2(sx, sy, nx, ny))
-    return (
-        fma(on_n, rx, fma(k, sx, bx)),
-        fma(on_n, ry, fma(k, sy, by)),
-        along + on_n,
-        fma(on_r, rx, fma(on_s, sx, fx)),
-        fma(on_r, ry, fma(on_s, sy, fy)),
-    )
-
-
-@law
-def planar_wrench(sums: PlanarSums, nx: float, ny: float) -> tuple[float, float, float]:
-    """Return F_x, F_y (N) and tau_z (N m) of the sources summed up, on the moment n in the plane."""
-    bx, by, along, fx, fy = sums
-    return fma(along, nx, fx), fma(along, ny, fy), cross2(nx, ny, bx, by)
-
-
-@law
-def robots_wrench(
-    lanes: Floats, i: int, n_epm: int, x1: float, y1: float, heading1: float, x2: float, y2: float, heading2: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return F_x, F_y (N) and tau_z (N m) on both robots of lane ``i`` at these poses, global frame.
-
-    Out-of-plane components are borne by the plane. Between the robots the wrench is computed once: their forces are
-    opposite, and their torques and the force's moment add up to nothing.
-    """
-    s, c = sincos(heading1)
-    m1x, m1y = lanes[MOMENT1, i] * c, lanes[MOMENT1, i] * s
-    s, c = sincos(heading2)
-    m2x, m2y = lanes[MOMENT2, i] * c, lanes[MOMENT2, i] * s
-    none = (0.0, 0.0, 0.0, 0.0, 0.0)
-    dx, dy = x2 - x1, y2 - y1
-    mutual = add_source(none, SOURCE * m1x, SOURCE * m1y, 0.0, m2x, m2y, dx, dy, 0.0)
-    fx, fy, turn = planar_wrench(mutual, m2x, m2y)
-    on1, on2 = none, none
-    for k in range(n_epm):
-        e = EPMS + EPM_SIZE * k
-        ex, ey, height2 = lanes[e, i], lanes[e + 1, i], lanes[e + 2, i]
-        sx, sy, s_height = lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i]
-        on1 = add_source(on1, sx, sy, s_height, m1x, m1y, x1 - ex, y1 - ey, height2)
-        on2 = add_source(on2, sx, sy, s_height, m2x, m2y, x2 - ex, y2 - ey, height2)
-    f1x, f1y, tz1 = planar_wrench(on1, m1x, m1y)
-    f2x, f2y, tz2 = planar_wrench(on2, m2x, m2y)
-    return f1x - fx, f1y - fy, tz1 - (cross2(dx, dy, fx, fy) + turn), f2x + fx, f2y + fy, tz2 + turn
-
-
-@law
-def place_epm(
-    lanes: Floats, i: int, k: int, moment: float, x: float, y: float, z: float, ux: float, uy: float, uz: float
-) -> None:
-    """Put EPM ``k``, its moment (A m^2) along the unit vector u, into lane ``i``: what ``add_source`` needs of it."""
-    e, strength = EPMS + EPM_SIZE * k, SOURCE * moment
-    lanes[e, i], lanes[e + 1, i], lanes[e + 2, i] = x, y, z * z
-    lanes[e + 3, i], lanes[e + 4, i], lanes[e + 5, i] = strength * ux, strength * uy, -strength * uz * z
-
-
-@law
-def copy_epms(source: Floats, row: int, target: Floats, to: int) -> None:
-    """Write the EPMs of a row (n, N, 6) into a row of ``target``; written out, as slices are functions to numba."""
-    for k in range(source.shape[1]):
-        for j in range(EPM_SIZE):
-            target[to, k, j] = source[row, k, j]
-
-
-@law
-def place_all(lanes: Floats, i: int, moments: Floats, epms: Floats, row: int) -> None:
-    """Put the EPMs (n, N, 6) of a row, of moments (n, N) in A m^2, into lane ``i``."""
-    for k in range(epms.shape[1]):
-        x, y, z = epms[row, k, 0], epms[row, k, 1], epms[row, k, 2]
-        place_epm(lanes, i, k, moments[row, k], x, y, z, epms[row, k, 3], epms[row, k, 4], epms[row, k, 5])
 
 
 @kernel
@@ -277,7 +182,7 @@ def _rub_both(lanes: Floats, i: int, gain: float, vx: float, vy: float) -> Pair:
 
 
 @law
-def advance(lanes: Floats, i: int, n_epm: int, h: float, rough: bool) -> None:
+def advance(lanes: Floats, i: int, n_epm: int, size: Size, h: float, rough: bool) -> None:
     """Advance both robots of lane ``i`` by ``h`` (s), contact apart; where ``rough``, pushed and rubbed as well.
 
     Half a drift, a kick with drag integrated exactly, half a drift: symmetric, so of second order, with one evaluation
@@ -288,7 +193,7 @@ def advance(lanes: Floats, i: int, n_epm: int, h: float, rough: bool) -> None:
     vx2, vy2, rate2 = lanes[VX2, i], lanes[VY2, i], lanes[RATE2, i]
     x1, y1, heading1 = fma(half, vx1, lanes[X1, i]), fma(half, vy1, lanes[Y1, i]), fma(half, rate1, lanes[HEADING1, i])
     x2, y2, heading2 = fma(half, vx2, lanes[X2, i]), fma(half, vy2, lanes[Y2, i]), fma(half, rate2, lanes[HEADING2, i])
-    f1x, f1y, tz1, f2x, f2y, tz2 = robots_wrench(lanes, i, n_epm, x1, y1, heading1, x2, y2, heading2)
+    f1x, f1y, tz1, f2x, f2y, tz2 = robots_wrench(lanes, i, n_epm, size, x1, y1, heading1, x2, y2, heading2)
     if rough:
         f1x, f1y, tz1 = f1x + lanes[PUSH_X1, i], f1y + lanes[PUSH_Y1, i], tz1 + lanes[PUSH_TURN1, i]
         f2x, f2y, tz2 = f2x + lanes[PUSH_X2, i], f2y + lanes[PUSH_Y2, i], tz2 + lanes[PUSH_TURN2, i]

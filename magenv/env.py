@@ -70,8 +70,9 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | | | and end at rest (5 m/s^2, 10 rad/s^2), commands act 0.1 s late, noise is 1.3 mm and 1.1 degrees, |
     | | | masses, drags and moments differ by up to 20 % from the nominal ones, anew in each episode; |
     | | | ``arm-reach``: ``arm``, each EPM within 0.41 to 0.82 m of a shoulder of its own beside the workspace, all |
-    | | | the way; ``low-drag``, ``high-drag``: ``paper`` at the ends of what drag may be. Parameters of |
-    | | | ``magenv.params.Plant`` may be changed behind a colon: ``arm:latency_s=0.05,disturbance_n=1e-3`` |
+    | | | the way; ``low-drag``, ``high-drag``: ``paper`` at the ends of what drag may be; ``cylinders``: ``paper`` |
+    | | | with EPMs that act as the cylinders that they are, not as dipoles. Parameters of ``magenv.params.Plant`` may |
+    | | | be changed behind a colon: ``arm:latency_s=0.05,disturbance_n=1e-3``, ``arm:epm_cylinders=true`` |
     | ``n_epm`` | 2 | 2 or 3 |
     | ``action`` | ``home`` | see above |
     | ``observation`` | ``full`` | ``full`` or ``errors`` |

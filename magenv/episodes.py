@@ -121,6 +121,7 @@ class Episodes:
             constants=w.constants,
             mass=physics.mass,
             epm_moment=physics.epm_moment,
+            epm_size=physics.epm_size,
             coefficients=w.coefficients,
             duration=w.duration_s,
             step=w.step_count,

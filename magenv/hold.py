@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos, wrap
 from magenv.arithmetic import dot2
-from magenv.dynamics import TOUCH, WALL, advance, copy_epms, may_touch, place_all, resolve_contact
+from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
 from magenv.kernels import kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
@@ -47,6 +47,7 @@ from magenv.lanes import (
     Y2,
     fields,
 )
+from magenv.magnets import Size, copy_epms, place_all
 from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
 from magenv.travel import Motion, carry, command, give_way, go_on, is_due, put_down, set_off, take_up
 
@@ -156,6 +157,7 @@ def hold_rows(
     constants: Floats,
     mass: Floats,
     epm_moment: Floats,
+    epm_size: Size,
     coefficients: Floats,
     duration: Floats,
     step: NDArray[np.int64],
@@ -182,7 +184,7 @@ def hold_rows(
     A lane whose hold is over takes the next active row, so that no lane waits for another; lanes without a row
     compute on, unseen. The lengths of the last tuples, which are types to numba, are the numbers of EPMs and of lanes,
     how commands act (``AT_ONCE``, ``LATE``, ``TRAVELLING``) and whether the plant is rough: constants of the machine
-    code, so that the magnets are unrolled and the lanes vectorised.
+    code, so that the magnets are unrolled and the lanes vectorised; so is whether EPMs have a size (see ``magnets``).
 
     ``routes`` (n, N, 48) is how EPMs move from hold to hold, ``queue`` (n, 1 + wait, N, 6) the commands that do not act
     yet, ``slow`` (n, 2, 3) angular frequency (rad/s) and phases (rad) of the force that disturbs each robot, and
@@ -216,7 +218,7 @@ def hold_rows(
                     if travels:
                         take_up(lanes, i, epm_moment[row], epms[row], routes[row])
                     else:
-                        place_all(lanes, i, epm_moment, epms, row)
+                        place_all(lanes, i, epm_size, epm_moment, epms, row)
                     if rough:
                         _disturb(lanes, i, slow[row], rubs, step[row] * period)
                     which = trajectory_of(row, len(duration))
@@ -246,7 +248,7 @@ def hold_rows(
                                 command(lanes, i, queue[row, sent % queue.shape[1]])
                             else:
                                 copy_epms(queue[row], sent % queue.shape[1], epms, row)
-                                place_all(lanes, i, epm_moment, epms, row)
+                                place_all(lanes, i, epm_size, epm_moment, epms, row)
                         if travels:
                             set_off(lanes, i, n_epm, motion)
         rare = False
@@ -261,8 +263,8 @@ def hold_rows(
         rare = False
         for i in range(width):
             if travels:
-                carry(lanes, i, n_epm)
-            advance(lanes, i, n_epm, h, rough)
+                carry(lanes, i, n_epm, epm_size)
+            advance(lanes, i, n_epm, epm_size, h, rough)
             flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
             rare |= flagged[i]
         if rare:

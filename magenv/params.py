@@ -113,6 +113,12 @@ class System:
         return self.ipm.moment_am2
 
     @cached_property
+    def epm(self) -> Magnet:
+        """The magnet that each EPM is: of the reference's shape and of its share of the volume."""
+        share, one = (2.0 / self.n_epm) ** (1.0 / 3.0), self.reference_epm
+        return replace(one, diameter_m=share * one.diameter_m, length_m=share * one.length_m)
+
+    @cached_property
     def epm_moment_am2(self) -> float:
         """Moment of each EPM in A m^2: the volume of two reference magnets shared by ``n_epm``."""
         return 2.0 / self.n_epm * self.reference_epm.moment_am2
@@ -188,6 +194,9 @@ class Plant:
     """Of the shoulders from the workspace centre, level; the arms stand evenly round it (ours, as the next)."""
     arm_height_m: float = 0.45
     """Of the shoulders above the robots' plane, m: 0.36 m above what the arms stand on (data sheet)."""
+    epm_cylinders: bool = False
+    """Whether EPMs act on the robots as the cylinders that they are (``System.epm``) and not as dipoles. The robots'
+    magnets stay dipoles: 20 mm apart the force between them is 1.2 % off at most, that of an EPM at 0.15 m 12 %."""
 
     def __post_init__(self) -> None:
         _require_positive(workspace_radius_m=self.workspace_radius_m, substep_s=self.substep_s)
@@ -217,6 +226,7 @@ class Plant:
         )
         _require_positive(arm_distance_m=self.arm_distance_m)
         require(_is_number(self.arm_height_m), "arm_height_m", "a finite number", self.arm_height_m)
+        require(isinstance(self.epm_cylinders, bool), "epm_cylinders", "True or False", self.epm_cylinders)
         require(
             self.workspace_radius_m > self.body.diameter_m,
             "workspace_radius_m",
@@ -259,6 +269,7 @@ PLANTS: dict[str, Plant] = {
         noise_heading_rad=math.radians(1.1),
         mismatch=0.2,
     ),
+    "cylinders": Plant(epm_cylinders=True),
 }
 # Data sheet of the LBR iiwa 14 R820: 0.82 m from axis 2 to the wrist, round whose centre the EPM may be turned anyhow.
 PLANTS["arm-reach"] = replace(PLANTS["arm"], arm_reach_m=0.82)
@@ -266,7 +277,7 @@ PLANTS["arm-reach"] = replace(PLANTS["arm"], arm_reach_m=0.82)
 ``high-drag``: the same at the ends of what robots' drag may be. ``moving``: as ``paper``, but the EPMs move there at
 finite speed, and act on the robots on the way. ``arm``: they do so with finite acceleration, commands act late,
 measurements are noisy, and the plant's parameters are not quite the nominal ones. ``arm-reach``: nor do the arms reach
-everywhere."""
+everywhere. ``cylinders``: as ``paper``, but the EPMs are cylinders; to controllers they are dipoles on every plant."""
 
 
 CONTROL_HZ_RANGE = (0.01, 1000.0)
@@ -311,7 +322,7 @@ def plant_named(text: str) -> Plant:
     Raises
     ------
     ValueError
-        If there is no such plant or parameter, or a value is no number or out of its range.
+        If there is no such plant or parameter, or a value is not of its type or out of its range.
     """
     known = ", ".join(sorted(PLANTS))
     require(isinstance(text, str), "plant", f"one of {known}", text)
@@ -322,12 +333,16 @@ def plant_named(text: str) -> Plant:
 
 def _changes(text: str, changes: str) -> dict[str, Any]:
     """Return the parameters told by the second part of a plant's text."""
-    known, found = [f.name for f in fields(Plant) if f.type == "float"], dict[str, Any]()
+    known, found = {f.name: f.type for f in fields(Plant) if f.type in ("float", "bool")}, dict[str, Any]()
     for change in changes.split(","):
         name, _, value = change.partition("=")
         require(name in known and name not in found, "plant", "changed once in any of " + ", ".join(known), text)
+        if known[name] == "bool":
+            require(value in ("true", "false"), "plant", f"changed by true or false in {name}", text)
+            found[name] = value == "true"
+            continue
         try:
             found[name] = float(value)
         except ValueError:
-            raise InputError(f"Input plant must be changed by numbers; instead received {text!r}.") from None
+            raise InputError(f"Input plant must be changed by numbers in {name}; instead received {text!r}.") from None
     return found

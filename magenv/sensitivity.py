@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.dynamics import Physics, advance, constants, place_epm, robots_wrench
+from magenv.dynamics import Physics, advance, constants
 from magenv.kernels import kernel, law
 from magenv.lanes import (
     CONSTANTS,
@@ -29,6 +29,7 @@ from magenv.lanes import (
     X1,
     fields,
 )
+from magenv.magnets import place_epm, robots_wrench
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE
 from magenv.stiffness import planar_kernel
@@ -40,7 +41,7 @@ COORDINATES = 6
 
 
 class Model(NamedTuple):
-    """What a controller believes of the plant, and room to compute in."""
+    """What a controller believes of the plant, EPMs that are dipoles among it, and room to compute in."""
 
     lane: Floats
     """(fields, 1): the plant's own layout, with the constants of a substep in place."""
@@ -110,7 +111,7 @@ def place(model: Model, epms: Floats) -> None:
     """Put EPMs (N, 6), centres and unit moments, into the model's lane."""
     for k in range(len(epms)):
         e = epms[k]
-        place_epm(model.lane, 0, k, model.epm_moment[k], e[0], e[1], e[2], e[3], e[4], e[5])
+        place_epm(model.lane, 0, k, None, model.epm_moment[k], e[0], e[1], e[2], e[3], e[4], e[5])
 
 
 @law
@@ -126,7 +127,7 @@ def believe(model: Model, amiss: Floats) -> None:
 @law
 def go(model: Model) -> None:
     """Go on by a substep."""
-    advance(model.lane, 0, len(model.epm_moment), model.substep, True)
+    advance(model.lane, 0, len(model.epm_moment), None, model.substep, True)
 
 
 @kernel
@@ -154,7 +155,7 @@ def by_moments(model: Model, epms: Floats, amiss: Floats, drive: Floats) -> None
     """
     n, (p, q), (m1, m2) = len(epms), model.positions, model.moments
     heading1, heading2 = math.atan2(m1[1], m1[0]), math.atan2(m2[1], m2[0])
-    whole = robots_wrench(model.lane, 0, n, p[0], p[1], heading1, q[0], q[1], heading2)
+    whole = robots_wrench(model.lane, 0, n, None, p[0], p[1], heading1, q[0], q[1], heading2)
     first = drive.shape[1] - n - 2
     for i in range(COORDINATES):
         mutual = whole[i]

@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel
+from magenv.magnets import Size
 from magenv.streams import Keys
 from magenv.travel import Motion
 
@@ -37,6 +38,8 @@ class State(NamedTuple):
     """(n, 2) kg"""
     epm_moment: Floats
     """(n, N) A m^2"""
+    epm_size: Size
+    """See ``magnets``."""
     coefficients: Floats
     """(n or 1, 32, 2, 3, 4)"""
     duration: Floats

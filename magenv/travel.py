@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.arithmetic import dot2, dot3
-from magenv.dynamics import place_epm
 from magenv.kernels import kernel, law
 from magenv.lanes import ROUTE_SIZE, carried_moment, route
+from magenv.magnets import Size, place_epm
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M
 from magenv.reach import REACH_TOLERANCE_M, Shell, project_reach, room, shoulder, stays
@@ -262,7 +262,7 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
 
 
 @law
-def carry(lanes: Floats, i: int, n_epm: int) -> None:
+def carry(lanes: Floats, i: int, n_epm: int, size: Size) -> None:
     """Carry the EPMs of lane ``i`` to where they go; put what acts on the robots where they are halfway."""
     for k in range(n_epm):
         e = route(n_epm, k)
@@ -273,7 +273,7 @@ def carry(lanes: Floats, i: int, n_epm: int) -> None:
         vx, vy, vz = _turn(lanes, i, e)
         x, y, z = 0.5 * (x + p), 0.5 * (y + q), 0.5 * (z + r)
         ux, uy, uz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)
-        place_epm(lanes, i, k, lanes[carried_moment(n_epm) + k, i], x, y, z, ux, uy, uz)
+        place_epm(lanes, i, k, size, lanes[carried_moment(n_epm) + k, i], x, y, z, ux, uy, uz)
 
 
 @kernel

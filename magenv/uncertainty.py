@@ -86,6 +86,7 @@ def draw_plants(
                 physics.drag_rotational[row],
                 physics.ipm_moment[row],
                 physics.epm_moment[row],
+                physics.epm_size,
                 physics.body_diameter,
                 physics.wall_radius,
             )

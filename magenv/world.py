@@ -229,6 +229,7 @@ class World:
             self.constants,
             self.physics.mass,
             self.physics.epm_moment,
+            self.physics.epm_size,
             self.coefficients,
             self.duration_s,
             self.step_count,

@@ -94,6 +94,12 @@ def test_workspace_holds_the_body() -> None:
         Plant(workspace_radius_m=0.01)
 
 
+@pytest.mark.parametrize("value", [1, 0.0, "true", None])
+def test_epms_are_cylinders_or_not(value: Any) -> None:
+    with pytest.raises(ValueError, match=told("epm_cylinders", "True or False", value)):
+        Plant(epm_cylinders=value)
+
+
 @pytest.mark.parametrize("name", ["loss_distance_m", "tracking_distance_m"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf])
 def test_task_is_positive(name: str, value: float) -> None:

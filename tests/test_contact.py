@@ -85,7 +85,7 @@ def test_attracted_robots_never_pass_through_each_other(rng: np.random.Generator
         state[1, 0] = distance
         lane, flags = one_lane(state, np.zeros((0, 6)), physics, h), 0
         for _ in range(400):
-            advance(lane, 0, 0, h, False)
+            advance(lane, 0, 0, None, h, False)
             near = may_touch(lane, 0, DIAMETER, plant.workspace_radius_m)
             state = lane[:12, 0].reshape(6, 2).T.copy()
             contact = resolve_contact(state, physics.mass[0], DIAMETER, plant.workspace_radius_m)

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from lane import SYSTEM, magnets, one_lane, run
+from lane import SYSTEM, magnets, run, wrenches
 from numpy.typing import NDArray
 
 from magenv.dipole import field
-from magenv.dynamics import Physics, robots_wrench
+from magenv.dynamics import Physics
 from magenv.params import Body, Plant, System
 from magenv.poses import from_cartesian
 from magenv.wrench import planar_moments, robot_wrench
@@ -33,15 +33,6 @@ def states(rng: np.random.Generator, n: int = 1) -> Floats:
     return robots
 
 
-def wrenches(robots: Floats, epms: Floats, system: System, ipm_moment: Floats | None = None) -> Floats:
-    """F_x, F_y, tau_z (2, 3) on the robots."""
-    physics = Physics.of(system, WIDE, 1)
-    if ipm_moment is not None:
-        physics.ipm_moment[0] = ipm_moment
-    lane = one_lane(robots, epms, physics, 0.005)
-    return np.array(robots_wrench(lane, 0, len(epms), *robots[0, :3], *robots[1, :3])).reshape(2, 3)
-
-
 def energy(robots: Floats, epms: Floats, body: Body) -> float:
     """Kinetic energy and that of both moments in the field of the EPMs and of each other, in J."""
     positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=-1)
@@ -57,7 +48,7 @@ def test_planar_wrench_is_the_planar_part_of_u(rng: np.random.Generator, n_epm: 
     system = System(n_epm=n_epm)
     for robots in states(rng, 20):
         epms = magnets(rng, system)
-        out = wrenches(robots, epms, system)
+        out = wrenches(robots, epms, Physics.of(system, WIDE, 1))
         positions = np.concatenate([robots[:, :2], np.zeros((2, 1))], axis=-1)
         pose = from_cartesian(epms[:, :3], epms[:, 3:])
         moments = planar_moments(robots[:, 2], system.ipm_moment_am2)
@@ -69,8 +60,10 @@ def test_planar_wrench_is_the_planar_part_of_u(rng: np.random.Generator, n_epm: 
 
 def test_force_between_robots_cancels_to_the_last_bit(rng: np.random.Generator) -> None:
     """Third law in the plant; there are no EPMs here."""
+    physics = Physics.of(SYSTEM, WIDE, 1)
+    physics.ipm_moment[0] = 0.1, 0.2
     for robots in states(rng, 20):
-        out = wrenches(robots, np.zeros((0, 6)), SYSTEM, np.array([0.1, 0.2]))
+        out = wrenches(robots, np.zeros((0, 6)), physics)
         np.testing.assert_array_equal(out[0, :2], -out[1, :2])
         dx, dy = robots[1, :2] - robots[0, :2]
         total = out[0, 2] + out[1, 2] + dx * out[1, 1] - dy * out[1, 0]
@@ -119,7 +112,7 @@ def test_terminal_velocity_is_exact_however_strong_the_drag(rng: np.random.Gener
     body = Body(mass_kg=1e-6, inertia_kgm2=1e-10, drag_linear_nspm=10.0, drag_rotational_nmsprad=1e-3)
     plant, epms = Plant(body=body), magnets(rng)
     before, after = run(states(rng)[0] * [1, 1, 1, 0, 0, 0], epms, plant, 0.005, 1)
-    force = wrenches(before, epms, SYSTEM)
+    force = wrenches(before, epms, Physics.of(SYSTEM, WIDE, 1))
     np.testing.assert_allclose(after[:, 3:], force / [10.0, 10.0, 1e-3], rtol=1e-13)
 
 

@@ -208,6 +208,8 @@ def test_plant_with_changed_parameters(make_env: MakeEnv) -> None:
     changed = plant_named("arm:latency_s=0.05,disturbance_n=1e-3")
     assert changed == dataclasses.replace(PLANTS["arm"], latency_s=0.05, disturbance_n=1e-3)
     assert plant_named("arm") is PLANTS["arm"]
+    for value in ("true", "false"):
+        assert plant_named(f"arm:epm_cylinders={value}").epm_cylinders == (value == "true")
     env = make_env(plant="paper:epm_speed_mps=1,epm_turn_radps=3.141592653589793")
     twin = make_env(plant="moving")
     env.reset(seed=0)

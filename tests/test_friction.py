@@ -41,7 +41,7 @@ def path(lane: Floats, steps: int) -> Floats:
     """States (steps + 1, 2, 6) on a rough plant."""
     found = [states(lane)]
     for _ in range(steps):
-        advance(lane, 0, 0, H, True)
+        advance(lane, 0, 0, None, H, True)
         found.append(states(lane))
     return np.array(found)
 
@@ -121,8 +121,8 @@ def test_without_friction_and_push_a_rough_plant_is_the_same_to_the_last_bit(
         smooth = one_lane(robots, magnets(rng, system), Physics.of(system, PAPER, 1), H)
         rough = smooth.copy()
         for _ in range(20):
-            advance(smooth, 0, n_epm, H, False)
-            advance(rough, 0, n_epm, H, True)
+            advance(smooth, 0, n_epm, None, H, False)
+            advance(rough, 0, n_epm, None, H, True)
         np.testing.assert_array_equal(rough, smooth)
         assert math.isfinite(smooth.sum())
 

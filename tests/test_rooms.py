@@ -54,6 +54,7 @@ ORDER = [
     "random_knots",
     "trajectories",
     "lanes",
+    "magnets",
     "dynamics",
     "ways",
     "reach",

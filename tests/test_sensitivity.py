@@ -26,7 +26,7 @@ from foreseen import (
 from lane import magnets
 
 from magenv.forecast import STATE
-from magenv.params import System, TaskParams
+from magenv.params import PLANTS, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.sensitivity import Model
 from magenv.stiffness import planar_kernel
@@ -210,3 +210,11 @@ def test_a_model_shares_no_memory_with_another() -> None:
     one.lane[:] = 0.0
     assert two.epm_moment.min() > 0.0
     assert np.abs(two.lane).max() > 0.0
+
+
+def test_to_a_model_epms_are_dipoles() -> None:
+    """Of a plant in which they are cylinders as well."""
+    state = on_the_way(0.06, 50.0)
+    models = (Model.of(System(), plant, PAPER.substep_s) for plant in (PAPER, PLANTS["cylinders"]))
+    one, two = (end_of(model, state, UNMOVED, held(at_home(state), 40)) for model in models)
+    np.testing.assert_array_equal(one, two)

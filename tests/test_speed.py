@@ -53,9 +53,17 @@ def same(one: Steps, two: Steps, rows: slice) -> bool:
     )
 
 
-@pytest.mark.parametrize("n_epm", [2, 3])
 @pytest.mark.parametrize(
-    ("scenario", "plant"), [("approach-45", "paper"), ("random", "paper"), ("approach-45", "moving")]
+    ("scenario", "plant", "n_epm"),
+    [
+        ("approach-45", "paper", 2),
+        ("approach-45", "paper", 3),
+        ("random", "paper", 2),
+        ("random", "paper", 3),
+        ("approach-45", "moving", 2),
+        ("approach-45", "moving", 3),
+        ("approach-45", "cylinders", 2),
+    ],
 )
 def test_bits_depend_neither_on_lanes_nor_on_threads(scenario: str, plant: str, n_epm: int) -> None:
     """Many, few and single episodes, one to three threads, through many starts."""
