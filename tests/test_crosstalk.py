@@ -21,7 +21,7 @@ from magenv.crosstalk import (
     hold,
     holdable_separation,
 )
-from magenv.crosstalk.validity import clear_of_robots, epm_magnet
+from magenv.crosstalk.validity import clear_of_robots
 from magenv.params import PLANTS, Magnet, System
 from magenv.poses import from_cartesian, to_cartesian
 from magenv.wrench import robot_wrench
@@ -183,8 +183,8 @@ def test_far_cylinders_are_dipoles_and_near_ones_are_not() -> None:
 
 
 def test_epms_share_the_volume_in_the_reference_shape() -> None:
-    assert epm_magnet(TWO) == Magnet(0.1, 0.1)
-    three = epm_magnet(THREE)
+    assert TWO.epm == Magnet(0.1, 0.1)
+    three = THREE.epm
     assert three.moment_am2 == pytest.approx(THREE.epm_moment_am2)
     assert three.diameter_m == pytest.approx(three.length_m)
 

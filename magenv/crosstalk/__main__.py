@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -67,10 +65,6 @@ def main() -> None:
     options = parse(Options)
     tasks: list[Task] = []
     for part in dict.fromkeys(options.parts):
-        if part == "validity" and importlib.util.find_spec("magpylib") is None:
-            install = 'python -m pip install -c constraints.txt -e ".[exact]"'
-            print(f"Left out: validity, which needs magpylib ({install}).", file=sys.stderr)
-            continue
         tasks += PARTS[part](sorted(set(options.n_epm)), options.amplitude, options.starts)
     require(
         len(tasks) > 0, "parts", f"such that there is something to compute for n_epm {options.n_epm}", options.parts

@@ -1,11 +1,11 @@
-"""Where the dipole model breaks down: the same poses with magnets that are cylinders, by magpylib (an extra)."""
+"""Where the dipole model breaks down: the same poses with magnets that are cylinders."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,54 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from magenv.allocation import component_scales
 from magenv.allocation_input import draw_starts
 from magenv.crosstalk.activation import Activations, Pair
+from magenv.cylinder import field_and_gradient
 from magenv.margins import clearances, gap_margins, minimise_within
-from magenv.params import Magnet, System, require
+from magenv.params import System, require
 from magenv.poses import POSE_SIZE, project, to_cartesian
 from magenv.wrench import WRENCH_SIZE, robot_frames, robot_wrench, wrench_jacobian
 
-if TYPE_CHECKING:
-    import magpylib
-
 Floats = NDArray[np.float64]
-
-_OFFSET_M = 2e-4
-"""Of central differences: their error is 1e-5 of a gradient that changes over 5 cm."""
 
 _OPTIONS: Any = {"maxiter": 300, "ftol": 1e-12}
 _SLACK = 1e-6
 """Share by which a found distance may be below its limit and still count."""
 _LEAST_RADIUS_M = 0.01
 """Of a centre, where it is the robots that it must keep from: the pose vector is undefined at the workspace centre."""
-
-
-def _magpylib() -> Any:
-    try:
-        import magpylib
-    except ImportError as error:
-        raise ImportError('Finite cylinders need magpylib: python -m pip install -e ".[exact]"') from error
-    return magpylib
-
-
-def _cylinder(magnet: Magnet, centre: Floats, moment: Floats) -> magpylib.magnet.Cylinder:
-    """Return a cylinder of the magnet's size along the moment's direction, of the moment's size."""
-    from scipy.spatial.transform import Rotation
-
-    size = float(np.linalg.norm(moment))
-    turn, _ = Rotation.align_vectors(moment[None] / size, np.array([[0.0, 0.0, 1.0]]))
-    cylinder: magpylib.magnet.Cylinder = _magpylib().magnet.Cylinder(
-        magnetization=(0.0, 0.0, size / magnet.volume_m3),
-        dimension=(magnet.diameter_m, magnet.length_m),
-        position=centre,
-        orientation=turn,
-    )
-    return cylinder
-
-
-def epm_magnet(system: System) -> Magnet:
-    """Return the magnet that each EPM is: of the reference's shape and of its share of the volume."""
-    share = (system.epm_moment_am2 / system.reference_epm.moment_am2) ** (1.0 / 3.0)
-    one = system.reference_epm
-    return replace(one, diameter_m=share * one.diameter_m, length_m=share * one.length_m)
 
 
 def exact_wrench(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, system: System) -> Floats:
@@ -80,8 +45,6 @@ def exact_wrench(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, syst
 
     Raises
     ------
-    ImportError
-        If magpylib is not installed.
     ValueError
         If a shape does not fit or a number is not finite.
     """
@@ -90,18 +53,15 @@ def exact_wrench(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, syst
         fits = value.shape == shape and bool(np.isfinite(value).all())
         require(fits, name, f"a finite array of shape {shape}", value.shape)
     centres, directions = to_cartesian(x)
-    epm = epm_magnet(system)
-    epms = [_cylinder(epm, c, system.epm_moment_am2 * u) for c, u in zip(centres, directions, strict=True)]
-    steps = np.concatenate([np.zeros((1, 3)), _OFFSET_M * np.eye(3), -_OFFSET_M * np.eye(3)])
-    frames, mutual = np.empty((2, 3, 3)), np.empty(WRENCH_SIZE)
-    robot_frames(p, m, frames, mutual)
-    u = np.empty(WRENCH_SIZE)
-    for robot in range(2):
-        sources = [*epms, _cylinder(system.ipm, p[1 - robot], m[1 - robot])]
-        field = np.asarray(_magpylib().getB(sources, p[robot] + steps, sumup=True))
-        gradient = (field[1:4] - field[4:7]) / (2.0 * _OFFSET_M)  # [j, i] = dB_i / dp_j
-        torque, force = frames[robot] @ np.cross(m[robot], field[0]), frames[robot] @ (gradient @ m[robot])
-        u[5 * robot : 5 * robot + 5] = [torque[1], torque[2], *force]
+    epm, ipm = system.epm, system.ipm
+    frames, u = np.empty((2, 3, 3)), np.empty(WRENCH_SIZE)
+    robot_frames(p, m, frames, u)
+    for robot, other in ((0, 1), (1, 0)):
+        b, g = field_and_gradient(system.epm_moment_am2 * directions, epm.diameter_m, epm.length_m, centres, p[robot])
+        mutual_b, mutual_g = field_and_gradient(m[other], ipm.diameter_m, ipm.length_m, p[other], p[robot])
+        torque = frames[robot] @ np.cross(m[robot], b.sum(axis=0) + mutual_b)
+        force = frames[robot] @ ((g.sum(axis=0) + mutual_g) @ m[robot])
+        u[5 * robot : 5 * robot + 5] = [*torque[1:], *force]
     return u
 
 
