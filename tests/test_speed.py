@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magenv.allocation import allocate, allocate_batch
 from magenv.env import TwoRobots
 from magenv.hold import hold_rows, hold_shape
-from magenv.params import System, TaskParams
+from magenv.params import PLANTS, System, TaskParams
 from magenv.solver import best_of, descend
 from magenv.trajectories import approach
 from magenv.vector_env import TwoRobotsVector
@@ -146,14 +146,18 @@ def test_nan_in_a_lane_never_touches_its_neighbours() -> None:
 # Machine code
 
 
-@pytest.fixture(scope="module")
-def compiled() -> Any:
+def machine_code(plant: str) -> Any:
     """The hold of two EPMs in sixteen lanes, compiled here: numba does not show cached code."""
     cached: Any = hold_rows
-    world, idle = World(16, System(), TwoRobotsVector(1)._episodes.plant, TaskParams()), np.zeros(16, np.bool_)
+    world, idle = World(16, System(), PLANTS[plant], TaskParams()), np.zeros(16, np.bool_)
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
     fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(2, 16))
     return fresh
+
+
+@pytest.fixture(scope="module")
+def compiled() -> Any:
+    return machine_code("paper")
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
@@ -165,6 +169,13 @@ def test_substeps_are_vectorised(compiled: Any) -> None:
     wide = llvmlite.binding.get_host_cpu_features().get("avx512f", False)
     assert set(registers) == {"zmm" if wide else "ymm"}
     assert not re.search(r"\bv?(mul|add)ps\b", assembly), "nothing is rounded to single precision"
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+def test_cylinders_are_vectorised() -> None:
+    """Two EPMs' two ends at each of two robots, eight roots and more of each."""
+    (assembly,) = machine_code("cylinders").inspect_asm().values()
+    assert len(re.findall(r"\bvsqrtpd\b", assembly)) >= 8 * 8
 
 
 def test_the_hold_allocates_before_its_loops_and_calls_nothing_within(compiled: Any) -> None:
