@@ -64,8 +64,8 @@ def test_a_report_is_complete(records: list[Record], tmp_path: Path) -> None:
 
 def test_a_report_in_an_old_ones_folder_leaves_nothing_of_it(records: list[Record], tmp_path: Path) -> None:
     for one, other in (("approach-60", "approach-30"), ("approach-60", "approach-60")):
-        write_report([a_record(scenario=one)], tmp_path, "")
-        write_report([a_record(scenario=other, controller="ppo")], tmp_path, "")
+        write_report([a_record(scenario=one, plant="arm:epm_cylinders=true")], tmp_path, "")
+        write_report([a_record(scenario=other, plant="arm:epm_cylinders=true", controller="ppo")], tmp_path, "")
         pictures = {path.name for path in tmp_path.iterdir() if path.suffix in (".png", ".gif")}
         assert len(pictures) == 4
         assert all(other in name for name in pictures)
