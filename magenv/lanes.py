@@ -37,7 +37,7 @@ MEASURED_SIZE = 6
 PUSH_X1, PUSH_X2, PUSH_Y1, PUSH_Y2, PUSH_TURN1, PUSH_TURN2, FRICTION, TURN_FRICTION = range(58, 66)
 
 EPMS = 66
-"""First field of the EPMs: six numbers of each, in the order of ``dynamics.place_epm``."""
+"""First field of the EPMs: six numbers of each, in the order of ``magnets.place_epm``."""
 
 
 ROUTE_SIZE = 48
