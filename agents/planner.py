@@ -96,8 +96,7 @@ class Planner:
 
     def path(self, before: Floats, command: Floats) -> Floats:
         """Return where the EPMs are in each substep (M, N, 6) of a command's time, the ones before standing there."""
-        bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
-        move(self._arms, before, command, bases, self._motion, False)
+        move(self._arms, before, command, np.empty((0, len(command), EPM_SIZE, POSE_SIZE)), self._motion)
         return self._motion.path[self._motion.which]
 
     def _polish(self, problem: Problem, commands: Floats) -> float:
@@ -127,7 +126,7 @@ class Planner:
             return cost if self._stages == 1 else math.inf, first
         goal, commands, state, before = problem.goal, [first[0]], problem.state.copy(), problem.before
         for stage in range(1, self._stages):
-            land(self.model, state, problem.pushing, goal, self._arms, self._motion, before, commands[-1])
+            land(self.model, state, problem.pushing, goal, self._arms, self._motion, stage - 1, before, commands[-1])
             before = commands[-1]
             later = Problem(
                 state,

@@ -155,7 +155,7 @@ def _linearise(
         old = before if stage == 0 else commands[stage - 1]
         for k in range(len(before)):
             local_basis(commands[stage, k], s.bases[stage + 1, k])
-        move(arms, old, commands[stage], s.bases[stage : stage + 2], motion, True)
+        move(arms, old, commands[stage], s.bases[stage : stage + 2], motion)
         s.states[stage + 1] = s.states[stage]
         sensitivity = np.zeros((STATE, STATE + 2 * u - first))
         for i in range(STATE):
@@ -168,7 +168,8 @@ def _linearise(
             scale = lean_on(s.by[0, :, u : u + STATE], goal.weights, doubt, s.lean)
             residuals[at : at + STATE], jacobian[at : at + STATE] = 0.0, 0.0
             if scale > 0.0:
-                cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, jacobian, True)
+                seen = np.zeros((STATE, u))
+                cost += risk(model, pushing, motion, goal, stage, s.states[0], s.lean, scale, seen, residuals, jacobian)
         at += STATE
         cost += _away(commands[stage], goal.home[stage], s.bases[stage + 1], goal.pull, residuals, jacobian, at)
         at += EPM_SIZE * len(before)
@@ -269,13 +270,15 @@ def _forward(
             at = POSE_SIZE * k
             shift(trial[k], s.bases[stage + 1, k], step[at : at + POSE_SIZE], arms.limits.r_min, arms.limits.r_max)
         allow(arms, old, trial)
-        move(arms, old, trial, s.bases[stage : stage + 2], motion, False)
+        move(arms, old, trial, s.bases[:0], motion)
         s.trial_states[stage + 1] = s.trial_states[stage]
         cost += roll(
             model, s.trial_states[stage + 1], pushing, motion, goal, stage, none, residuals, s.jacobians[stage]
         )
         if stage == 0 and scale > 0.0:
-            cost += risk(model, pushing, motion, goal, s.states[0], s.lean, scale, residuals, s.jacobians[0], False)
+            cost += risk(
+                model, pushing, motion, goal, stage, s.states[0], s.lean, scale, none, residuals, s.jacobians[0]
+            )
         for k in range(n_epm):
             for a in range(EPM_SIZE):
                 cost += (goal.pull * (_PER_RADIUS if a < 3 else 1.0) * (trial[k, a] - goal.home[stage, k, a])) ** 2
@@ -339,14 +342,15 @@ def land(
     goal: Goal,
     arms: Arms,
     motion: Course,
+    stage: int,
     before: Floats,
     command: Floats,
 ) -> float:
     """Turn ``state`` (12,) into the one after the time of a command (N, 6); return the cost of the errors in it.
 
-    ``pushing`` (6,) acts throughout, N and N m; the EPMs stood at ``before`` (N, 6).
+    ``pushing`` (6,) acts throughout, N and N m; the EPMs stood at ``before`` (N, 6). ``stage`` tells which of the
+    goal's references count.
     """
     none, residuals, nothing = np.empty((STATE, 0)), np.empty(STATE * len(goal.marks)), np.empty((0, 0))
-    bases = np.zeros((2, len(command), EPM_SIZE, POSE_SIZE))
-    move(arms, before, command, bases, motion, False)
-    return roll(model, state, pushing, motion, goal, 0, none, residuals, nothing)
+    move(arms, before, command, np.empty((0, len(command), EPM_SIZE, POSE_SIZE)), motion)
+    return roll(model, state, pushing, motion, goal, stage, none, residuals, nothing)

@@ -80,12 +80,12 @@ def _go_part(
     reach: float,
     motion: Course,
     k: int,
-    differentiated: bool,
 ) -> None:
     """Write the motion of EPM ``k``'s centre (``first`` 0) or moment (3) from start to goal (3,), and its derivatives.
 
-    ``bases`` (2, 6, 5) are those of the EPM at both. The derivatives of a great circle by its ends: an end that moves
-    along it takes what is gone of it along in proportion, one that moves across by the sine of what is gone.
+    ``bases`` (2, N, 6, 5) are those of the EPMs at both; without, there are no derivatives. Those of a great circle by
+    its ends: an end that moves along it takes what is gone of it along in proportion, one that moves across by the
+    sine of what is gone.
     """
     near, u = _unit(start)
     far, v = _unit(goal)
@@ -107,18 +107,16 @@ def _go_part(
                 motion.path[j - 1, k, first + i] += 0.5 * place
             if j < rows:
                 motion.path[j, k, first + i] = 0.5 * place
-        if not differentiated:
-            continue
-        for new in range(2):
+        for new in range(len(bases)):
             gone = share if new == 1 else 1.0 - share
             across = math.sin(gone * angle) / sine if sine > 1e-6 else gone
             size = far if new == 1 else near
             end = ends[1 - new]
             for column in range(first, 3 if first == 0 else 5):
-                basis, along, aside = bases[new, first:, column], 0.0, 0.0
+                along, aside = 0.0, 0.0
                 for i in range(3):
-                    along += end[i] * basis[i] / size
-                    aside += b[i] * basis[i] / size
+                    along += end[i] * bases[new, k, first + i, column] / size
+                    aside += b[i] * bases[new, k, first + i, column] / size
                 for i in range(3):
                     by = radius * (gone * along * (c * t[i] - s * u[i]) + across * aside * b[i])
                     if first == 0 and column == 2:
@@ -130,17 +128,22 @@ def _go_part(
 
 
 @kernel
-def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Course, differentiated: bool) -> None:
-    """Write the motion from one command to the next, (N, 6) each; ``bases`` (2, N, 6, 5) are theirs."""
+def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Course) -> None:
+    """Write the motion from one command to the next, (N, 6) each.
+
+    ``bases`` (2, N, 6, 5) are theirs. Without any, (0, N, 6, 5), no derivatives are written.
+    """
     if not arms.travels:
         motion.path[0] = command
-        motion.by[0, 1] = bases[1]
+        if len(bases) > 0:
+            motion.by[0, 1] = bases[1]
         return
     limits = arms.limits
     for k in range(len(command)):
-        both = bases[:, k].copy()
-        _go_part(before[k, :3], command[k, :3], both, 0, limits.rise, limits.reach, motion, k, differentiated)
-        _go_part(before[k, 3:], command[k, 3:], both, 3, limits.turn_rise, limits.turn, motion, k, differentiated)
+        for first in range(0, EPM_SIZE, 3):  # no literals: each would be compiled anew
+            rise, reach = (limits.rise, limits.reach) if first == 0 else (limits.turn_rise, limits.turn)
+            start, goal = before[k, first : first + 3], command[k, first : first + 3]
+            _go_part(start, goal, bases, first, rise, reach, motion, k)
 
 
 @kernel

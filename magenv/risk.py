@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from magenv.cholesky import add_product
 from magenv.forecast import STATE, Course, Goal, roll
 from magenv.kernels import kernel
-from magenv.poses import POSE_SIZE
 from magenv.sensitivity import Model
 
 Floats = NDArray[np.float64]
@@ -63,22 +62,23 @@ def risk(
     pushing: Floats,
     motion: Course,
     goal: Goal,
+    stage: int,
     start: Floats,
     lean: Floats,
     scale: float,
+    sensitivity: Floats,
     residuals: Floats,
     jacobian: Floats,
-    differentiated: bool,
 ) -> float:
     """Write what is leant on makes of the last errors below them into the residuals (r,); return its cost.
 
     ``lean`` (12,) is added to ``start`` (12,), ``scale`` by how much it was scaled; ``pushing`` (6,) acts, N and N m.
-    Where ``differentiated``, the derivatives by the command are written into the last columns of ``jacobian`` (r, z).
+    Where ``sensitivity`` (12, 5 N or 0), zero, has columns, the derivatives by the command are written into the last
+    columns of ``jacobian`` (r, z).
     """
-    rows = STATE * len(goal.marks)
-    width = POSE_SIZE * len(model.epm_moment) if differentiated else 0
-    errors, by, sensitivity = np.empty(rows), np.empty((rows, width)), np.zeros((STATE, width))
-    roll(model, start + lean, pushing, motion, goal, 0, sensitivity, errors, by)
+    rows, width = STATE * len(goal.marks), sensitivity.shape[1]
+    errors, by = np.empty(rows), np.empty((rows, width))
+    roll(model, start + lean, pushing, motion, goal, stage, sensitivity, errors, by)
     cost, first = 0.0, jacobian.shape[1] - width
     for i in range(STATE):
         last, at = rows - STATE + i, rows + i

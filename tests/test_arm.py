@@ -109,7 +109,7 @@ def test_the_motion_foreseen_is_the_motion(rng: np.random.Generator) -> None:
         start, goal = magnets(rng), magnets(rng)
         allow(arms, start, goal)
         way = ways(world_of(start[None]), [(goal[None], substeps)])[:, 0]
-        move(arms, start, goal, np.zeros((2, 2, 6, 5)), motion, False)
+        move(arms, start, goal, np.empty((0, 2, 6, 5)), motion)
         if np.linalg.norm(way[:, 0, :3] - way[:, 1, :3], axis=1).min() > system.gap_min_m + 0.05:
             checked += 1
             np.testing.assert_allclose(0.5 * (way[1:] + way[:-1]), motion.path, rtol=0, atol=1e-12)

@@ -144,6 +144,6 @@ def test_landing_is_the_motion_itself() -> None:
     command = shifted(task.before, np.full(10, 0.05))
     end, errors, _ = foreseen(task.model, task.state, PUSH, held(command, SUBSTEPS), task.goal)
     state, motion = task.state.copy(), Course.of(2, SUBSTEPS, False)
-    cost = land(task.model, state, PUSH, task.goal, task.arms, motion, task.before, command)
+    cost = land(task.model, state, PUSH, task.goal, task.arms, motion, 0, task.before, command)
     np.testing.assert_array_equal(state, end)
     assert cost == pytest.approx(errors @ errors, rel=1e-14)

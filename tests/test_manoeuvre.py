@@ -27,7 +27,7 @@ def arms_of(plant: str, n_epm: int, substeps: int) -> Arms:
 def moved(arms: Arms, before: Floats, command: Floats, substeps: int) -> Course:
     """Course from one command to the next, with its derivatives."""
     motion = Course.of(len(command), substeps, True)
-    move(arms, before, command, np.stack([bases_of(before), bases_of(command)]), motion, True)
+    move(arms, before, command, np.stack([bases_of(before), bases_of(command)]), motion)
     return motion
 
 
@@ -58,7 +58,7 @@ def test_what_jumps_is_where_it_is_commanded(rng: np.random.Generator) -> None:
     before, command = magnets(rng), magnets(rng)
     motion = Course.of(2, 10, False)
     bases = np.stack([bases_of(before), bases_of(command)])
-    move(arms_of("paper", 2, 10), before, command, bases, motion, True)
+    move(arms_of("paper", 2, 10), before, command, bases, motion)
     np.testing.assert_array_equal(motion.path, command[None])
     np.testing.assert_array_equal(motion.by[0, 1], bases[1])
     assert (motion.by[0, 0] == 0.0).all()

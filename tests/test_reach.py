@@ -346,7 +346,7 @@ def test_what_is_allowed_is_within_reach_all_the_way_as_foreseen(rng: np.random.
             again = commands[row].copy()
             allow(arms, before[row], again)
             np.testing.assert_allclose(again, commands[row], atol=1e-9)
-            move(arms, before[row], commands[row], np.zeros((2, n_epm, 6, 5)), motion, False)
+            move(arms, before[row], commands[row], np.empty((0, n_epm, 6, 5)), motion)
             foreseen[:, row] = motion.path
         poses = np.stack([pose_to_action(from_cartesian(each[:, :3], each[:, 3:]), system) for each in commands])
         targets, projected = actions.to_epms(poses.astype(np.float64), np.zeros((rows, 2, 3)), world.epms)

@@ -49,8 +49,8 @@ class Doubted:
         errors, by, _ = self.linearised(epms)
         residuals, jacobian = np.zeros(3 * STATE), np.zeros((3 * STATE, 3 + by.shape[1]))
         residuals[: 2 * STATE], jacobian[: 2 * STATE, 3:] = errors, by
-        motion = held(epms, SUBSTEPS)
-        cost = risk(self.model, UNMOVED, motion, self.goal, self.state, lean, scale, residuals, jacobian, True)
+        motion, seen = held(epms, SUBSTEPS), np.zeros((STATE, by.shape[1]))
+        cost = risk(self.model, UNMOVED, motion, self.goal, 0, self.state, lean, scale, seen, residuals, jacobian)
         np.testing.assert_array_equal(residuals[: 2 * STATE], errors)
         assert (jacobian[:, :3] == 0.0).all(), "columns that are not the command's"
         return cost, residuals[2 * STATE :], jacobian[2 * STATE :, 3:]
