@@ -6,13 +6,16 @@ its twin at its best: gains optimised on training trajectories (``python -m agen
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import RowGenerators
 from agents.pid import Gains, PIDState, pid_wrench
 from magenv.actions import ActionMode, planar_target, pose_to_action
-from magenv.allocation import allocate
+from magenv.allocation import Solution, allocate
+from magenv.outcome import outcome_of
 from magenv.params import Plant, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.task import Frame, Layout, ObservationMode, unpack
@@ -26,6 +29,15 @@ TUNED_GAINS = Gains(0.194, 7.47e-3, 6.91e-3, 8.03e-5, 6.04e-7, 1.77e-6)
 """Best of ``python -m agents.tune``."""
 STARTS = 10
 """Random starts of the allocation (paper)."""
+
+
+@dataclass
+class BaselineState:
+    """What is remembered of ``n`` episodes; and how the last allocations ended."""
+
+    pid: PIDState
+    solver: NDArray[np.int64]
+    """(n,) codes into ``magenv.outcome.OUTCOMES``."""
 
 
 class Baseline:
@@ -65,26 +77,27 @@ class Baseline:
     def predict(
         self,
         observation: NDArray[np.float32],
-        state: PIDState | None = None,
+        state: BaselineState | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], PIDState]:
+    ) -> tuple[NDArray[np.float32], BaselineState]:
         """Return the ``pose`` actions (n, 5 N) for observations (n, d), or (5 N,) for (d,), and the new state."""
         batch = np.atleast_2d(observation)
         parts = unpack(batch, self._layout)
         present = from_cartesian(parts.epm_positions, parts.epm_directions)
         if state is None:
-            state = PIDState.start(len(batch))
+            state = BaselineState(PIDState.start(len(batch)), np.zeros(len(batch), np.int64))
         elif episode_start is not None:
-            state.restart(episode_start)
-        desired = pid_wrench(parts.error, state, self._gains, self._period_s)
+            state.pid.restart(episode_start)
+        desired = pid_wrench(parts.error, state.pid, self._gains, self._period_s)
         rows = zip(desired, parts.robots, present, self._rngs.of(len(batch)), strict=True)
-        poses = np.stack([self._allocate(*row) for row in rows])
-        actions = np.stack([pose_to_action(pose, self._system) for pose in poses])
+        found = [self._allocate(*row) for row in rows]
+        state.solver[:] = [outcome_of(solution.relative_residual) for solution in found]
+        actions = np.stack([pose_to_action(solution.pose, self._system) for solution in found])
         return actions.reshape(*np.shape(observation)[:-1], -1), state
 
-    def _allocate(self, desired: Floats, robots: Floats, present: Floats, rng: np.random.Generator) -> Floats:
-        """Return the poses for planar wrenches (2, 3) on robots (2, 3), out-of-plane components zero."""
+    def _allocate(self, desired: Floats, robots: Floats, present: Floats, rng: np.random.Generator) -> Solution:
+        """Return EPM poses for planar wrenches (2, 3) on robots (2, 3), out-of-plane components zero."""
         target = np.empty(WRENCH_SIZE)
         planar_target(desired.reshape(-1), robots[0, 2], robots[1, 2], target)
         positions = np.zeros((2, 3))
@@ -98,7 +111,7 @@ class Baseline:
             seed=rng,
             initial=present if self._warm_start else None,
             stop_early=self._warm_start,
-        ).pose
+        )
 
 
 def paper_baseline(n_epm: int = 2, control_hz: float = 2.0) -> Baseline:

@@ -77,7 +77,8 @@ class Controller(Protocol):
         action : ndarray of float32, shape (n, a) or (a,)
             Within [-1, 1].
         state
-            For the next call; None where there is no memory.
+            For the next call; None where there is no memory. A controller whose actions a solver finds tells how it
+            ended in an attribute ``solver`` (n,) of its state, codes into ``magenv.outcome.OUTCOMES``: it is recorded.
         """
         ...
 

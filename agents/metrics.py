@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest, bootstrap
 
+from agents.causes import lost_first
 from agents.records import Record
 from magenv.params import require
 
@@ -43,6 +45,10 @@ class Episode:
     loss_of_control_s: float | None
     separation_before_loss_mm: float | None
     """At the last instant at which both robots were near their references, where control was lost later."""
+    lost_first: str | None
+    """What was lost before control was, one of ``causes.CAUSES``; None where control was kept."""
+    lost_first_s: float | None
+    """From when on; None for ``other``, too."""
     control_step_ms: float
     """Median wall time of a call of ``predict``."""
 
@@ -77,6 +83,8 @@ class Summary:
     loss_of_control_s: float | None
     """Median over the lost episodes; so is the next."""
     separation_before_loss_mm: float | None
+    lost_first: dict[str, int]
+    """How many of the lost episodes lost what first (see ``causes``), the most frequent first; empty if none."""
     control_step_ms_p50: float
     """Percentiles over all calls of ``predict``."""
     control_step_ms_p99: float
@@ -84,7 +92,7 @@ class Summary:
 
 def measure(record: Record) -> Episode:
     """Return the scalars of one episode."""
-    lost = not record.success
+    lost, first = not record.success, lost_first(record)
     tracked = record.separation_tracked_m
     return Episode(
         controller=record.controller,
@@ -103,6 +111,8 @@ def measure(record: Record) -> Episode:
         min_separation_mm=1e3 * float(np.min(record.separation_min_m)),
         loss_of_control_s=record.loss_time_s,
         separation_before_loss_mm=1e3 * tracked if lost and tracked is not None else None,
+        lost_first=None if first is None else first.what,
+        lost_first_s=None if first is None else first.time_s,
         control_step_ms=float(np.median(record.step_ms)),
     )
 
@@ -167,6 +177,7 @@ def _summary(records: list[Record]) -> Summary:
         min_separation_mm=float(np.median([episode.min_separation_mm for episode in episodes])),
         loss_of_control_s=_median([episode.loss_of_control_s for episode in episodes]),
         separation_before_loss_mm=_median([episode.separation_before_loss_mm for episode in episodes]),
+        lost_first=dict(Counter(episode.lost_first for episode in episodes if episode.lost_first).most_common()),
         control_step_ms_p50=float(np.percentile(step_ms, 50)),
         control_step_ms_p99=float(np.percentile(step_ms, 99)),
     )

@@ -18,6 +18,8 @@ from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
 from magenv.home import home_epms, start_rows
 from magenv.observer import MOMENTS, Noise, correct, forecast
+from magenv.outcome import CONVERGED as SOLVED
+from magenv.outcome import FELL_BACK, NOT_CONVERGED
 from magenv.params import Plant, System, TaskParams, plant_named, require
 from magenv.poses import POSE_SIZE, from_cartesian
 from magenv.sensitivity import COORDINATES, believe
@@ -50,6 +52,7 @@ _ROOM = 3.0
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
 """How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
 the last safe command held."""
+_OUTCOMES = np.array([SOLVED, SOLVED, NOT_CONVERGED, FELL_BACK])
 
 
 @dataclass
@@ -75,6 +78,11 @@ class PredictiveState:
     rows: list[Memory | None]
     status: NDArray[np.int64]
     """(n,) codes: CONVERGED, SOUGHT, UNSOLVED, FALLBACK."""
+
+    @property
+    def solver(self) -> NDArray[np.int64]:
+        """(n,) the same in the words of all controllers, codes into ``magenv.outcome.OUTCOMES``."""
+        return _OUTCOMES[self.status]
 
 
 def _per_coordinate(position: float, heading: float) -> Floats:

@@ -16,7 +16,7 @@ from magenv.params import InputError, require
 
 Floats = NDArray[np.float64]
 
-FORMAT = "magenv records 1"
+FORMAT = "magenv records 2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,8 @@ class Record:
     """(K,) substeps of the hold: fewer where control was lost in it."""
     projected: NDArray[np.bool_]
     """(K,) whether the command's EPMs were too close, or out of reach, and were moved."""
+    solver: NDArray[np.int64]
+    """(K,) how the solver behind the command ended, codes into ``magenv.outcome.OUTCOMES``."""
     step_ms: Floats
     """(K,) wall time of ``predict``."""
 
@@ -118,7 +120,8 @@ def load(path: Path) -> list[Record]:
             return _records({name: file[name] for name in file.files})
     except (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"Input records file must be a readable file of magenv's records (.npz); instead received {str(path)!r}."
+            f"Input records file must be a readable file of magenv's records (.npz, {FORMAT!r}); "
+            f"instead received {str(path)!r}."
         ) from error
 
 

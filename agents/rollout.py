@@ -17,6 +17,7 @@ from agents.controller import Controller
 from agents.records import Record
 from magenv import ENV_ID
 from magenv.episodes import Settings
+from magenv.outcome import NO_SOLVER
 from magenv.params import TaskParams, require
 from magenv.trajectories import draw
 from magenv.world import LOSSES
@@ -95,11 +96,12 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
     observation, info = env.reset(seed=seed)
     controller.seed(controller_seed(seed))
     states, holds, step_ms = [info], [], []
-    state, ended, start = None, False, np.ones(1, np.bool_)
+    state, ended, start, solver = None, False, np.ones(1, np.bool_), []
     while not ended:
         before = time.perf_counter()
         actions, state = controller.predict(observation[None], state, start, deterministic=True)
         step_ms.append(1e3 * (time.perf_counter() - before))
+        solver.append(NO_SOLVER if getattr(state, "solver", None) is None else int(state.solver[0]))
         start = np.zeros(1, np.bool_)
         observation, _, terminated, truncated, info = env.step(actions[0])
         ended = terminated or truncated
@@ -124,6 +126,7 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
         epm_pose=_stack(states, "epm_pose"),
         reference=_reference(settings, seed),
         **{name: _stack(holds, name) for name in _MEASURED},
+        solver=np.array(solver),
         step_ms=np.array(step_ms),
     )
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magenv.dipole import dipole_field, dipole_force, dipole_force_gradient, dipole_gradient
 from magenv.kernels import kernel, law
-from magenv.params import require
+from magenv.params import Body, require
 from magenv.poses import POSE_SIZE, to_cartesian
 
 Floats = NDArray[np.float64]
@@ -150,3 +150,19 @@ def planar_stiffness(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, 
     out, epms = np.empty((6, 6)), np.concatenate(to_cartesian(x), axis=-1)
     planar_kernel(p, m, epms, np.full(len(epms), float(epm_moment_am2)), False, out, np.empty((6, 0)))
     return out
+
+
+def growth_rates(stiffness: Floats, body: Body) -> NDArray[np.complex128]:
+    """Return the rates (12, 1/s) at which small deviations grow while the EPMs stand still, the fastest first.
+
+    They are the eigenvalues of the linear motion M q'' + D q' = K q of both robots' x, y and heading, of mass and
+    inertia M, viscous drag D and magnetic stiffness K (6, 6); those with real parts above 0 grow.
+    """
+    inertia = np.tile([body.mass_kg, body.mass_kg, body.inertia_kgm2], 2)
+    drag = np.tile([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad], 2)
+    motion = np.zeros((12, 12))
+    motion[:6, 6:] = np.eye(6)
+    motion[6:, :6] = stiffness / inertia[:, None]
+    motion[6:, 6:] = np.diag(-drag / inertia)
+    rates = np.linalg.eigvals(motion).astype(np.complex128)
+    return rates[np.argsort(-rates.real, kind="stable")]

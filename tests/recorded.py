@@ -49,6 +49,7 @@ def a_record(held_steps: int = STEPS, error_m: float = 1e-3, **changes: Any) -> 
         separation_min_m=apart[1:],
         substeps=np.full(held_steps, 100),
         projected=np.zeros(held_steps, np.bool_),
+        solver=np.ones(held_steps, np.int64),
         step_ms=np.full(held_steps, 2.0),
     )
     return replace(record, **changes)

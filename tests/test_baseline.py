@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from recorded import a_record
 
 from agents import baseline, pid
-from agents.baseline import PAPER_GAINS, Baseline, paper_baseline, tuned_baseline
-from agents.pid import Gains, PIDState
+from agents.baseline import PAPER_GAINS, Baseline, BaselineState, paper_baseline, tuned_baseline
+from agents.pid import Gains
 from agents.records import Record
 from agents.tune import cost, gains_of
 from magenv.allocation import allocate
 from magenv.angles import wrap
+from magenv.outcome import CONVERGED
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import to_cartesian
 from magenv.task import Layout
@@ -105,7 +106,8 @@ def test_one_observation_or_many(make_env: Any, make: Any, n_epm: int) -> None:
     single, state = controller.predict(rows[0])
     assert single.shape == (5 * n_epm,)
     assert single.dtype == np.float32
-    assert isinstance(state, PIDState)
+    assert isinstance(state, BaselineState)
+    assert state.solver.tolist() == [CONVERGED]
     controller.seed(3)
     batch, _ = controller.predict(rows, None, np.ones(2, np.bool_))
     assert batch.shape == (2, 5 * n_epm)
@@ -148,10 +150,10 @@ def test_its_seed_fixes_its_actions_and_its_state_its_memory(observations: Obser
 def test_an_episode_that_starts_forgets_its_integral_alone(observations: Observations) -> None:
     controller = paper_baseline()
     _, state = controller.predict(observations[:2])
-    first = state.integral.copy()
+    first = state.pid.integral.copy()
     _, state = controller.predict(observations[:2], state, np.array([True, False]))
-    np.testing.assert_allclose(state.integral[0], first[0])
-    np.testing.assert_allclose(state.integral[1], 2 * first[1])
+    np.testing.assert_allclose(state.pid.integral[0], first[0])
+    np.testing.assert_allclose(state.pid.integral[1], 2 * first[1])
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def test_a_summary_has_the_agreed_keys_and_goes_into_strict_json() -> None:
     agreed = (
         "controller scenario plant n_epm control_hz action seed episodes success_rate position_error_mm "
         "heading_error_deg position_error_mm_ci heading_error_deg_ci position_error_until_end_mm min_separation_mm "
-        "loss_of_control_s separation_before_loss_mm control_step_ms_p50 control_step_ms_p99"
+        "loss_of_control_s separation_before_loss_mm lost_first control_step_ms_p50 control_step_ms_p99"
     )
     assert keys >= set(agreed.split())
     for held_steps in (STEPS, 10):

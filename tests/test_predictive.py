@@ -19,6 +19,7 @@ from agents.predictive import CONVERGED, FALLBACK, SOUGHT, UNSOLVED, Predictive,
 from agents.rollout import run
 from magenv.actions import pose_to_action
 from magenv.env import TwoRobots
+from magenv.outcome import FELL_BACK
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import from_cartesian
 from magenv.task import Layout, unpack
@@ -192,6 +193,7 @@ def test_where_nothing_can_be_foreseen_the_epms_stay(make_env: MakeEnv) -> None:
     observation = together(first(make_env(scenario="approach-60"), 0))
     action, state = Predictive().predict(observation)
     assert state.status[0] == FALLBACK
+    assert state.solver[0] == FELL_BACK
     np.testing.assert_array_equal(action, unmoved(observation))
 
 

@@ -87,6 +87,9 @@ def test_the_summary_is_strict_json_and_episodes_stand_beside_it(records: list[R
         episodes = list(csv.DictReader(file))
     assert list(episodes[0]) == [field.name for field in fields(Episode)]
     assert [episode["loss_of_control_s"] for episode in episodes] == ["15.0", "12.0", "18.0", "", "", ""]
+    assert [bool(episode["lost_first"]) for episode in episodes] == 3 * [True] + 3 * [False]
+    counts = [sum(row["lost_first"].values()) for row in summary["rows"]]
+    assert counts == [3, 0]
     (stored,) = (tmp_path / "records").glob("ppo*.npz")
     assert [record.seed for record in load(stored)] == [0, 1, 2]
 
@@ -118,6 +121,7 @@ def test_the_table_is_whole_in_80_columns(records: list[Record]) -> None:
     (lost,) = (line.split() for line in lines if line.strip().startswith("baseline"))
     assert lost[1:5] == ["0", "%", "-", "-"]
     assert "15.0" in lost
+    assert f"Lost first: baseline {next(iter(rows[0].lost_first))} 3." in text.getvalue()
     (wide,) = (index for index, line in enumerate(lines) if line.strip().startswith("wide"))
     assert lines[wide].split()[-1] == lines[wide + 1].split()[-1] == "123.4", "the last column is cut"
     assert re.search("[.0-9]{5}\N{EN DASH}[.0-9]{5} ", lines[wide + 1]), "no interval of full width"

@@ -28,6 +28,7 @@ ORDER = [
     "margins",
     "wrench",
     "stiffness",
+    "outcome",
     "spheres",
     "cholesky",
     "descent",

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magenv import stiffness
 from magenv.crosstalk.activation import Pair, is_positive
 from magenv.crosstalk.holdable import hold
 from magenv.params import Body, System, require
 from magenv.poses import POSE_SIZE
-from magenv.stiffness import planar_stiffness
 
 Floats = NDArray[np.float64]
 
@@ -26,10 +26,9 @@ _RADIUS_UNIT_M = 0.2
 
 
 def growth_rates(pair: Pair, system: System, pose: ArrayLike, body: Body) -> NDArray[np.complex128]:
-    """Return the rates (12, 1/s) at which small deviations from a hold grow, the fastest first; real parts above 0 do.
+    """Return the rates (12, 1/s) at which small deviations from a hold grow, the fastest first.
 
-    They are the eigenvalues of the linear motion M q'' + D q' = K q of both robots' x, y and heading, of mass and
-    inertia M, viscous drag D and magnetic stiffness K (see ``magenv.stiffness``).
+    Real parts above 0 grow; see ``magenv.stiffness.growth_rates``.
 
     Parameters
     ----------
@@ -45,15 +44,8 @@ def growth_rates(pair: Pair, system: System, pose: ArrayLike, body: Body) -> NDA
     x = np.asarray(pose, dtype=np.float64)
     fits = x.shape == (POSE_SIZE * system.n_epm,) and bool(np.isfinite(x).all())
     require(fits, "pose", f"a finite array of shape ({POSE_SIZE * system.n_epm},)", x.shape)
-    stiffness = planar_stiffness(pair.positions, pair.moments(system), x, system.epm_moment_am2)
-    inertia = np.tile([body.mass_kg, body.mass_kg, body.inertia_kgm2], 2)
-    drag = np.tile([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad], 2)
-    motion = np.zeros((12, 12))
-    motion[:6, 6:] = np.eye(6)
-    motion[6:, :6] = stiffness / inertia[:, None]
-    motion[6:, 6:] = np.diag(-drag / inertia)
-    rates = np.linalg.eigvals(motion).astype(np.complex128)
-    return rates[np.argsort(-rates.real, kind="stable")]
+    stiff = stiffness.planar_stiffness(pair.positions, pair.moments(system), x, system.epm_moment_am2)
+    return stiffness.growth_rates(stiff, body)
 
 
 def slowest_control_hz(rate: float, growth: float = 10.0) -> float:
