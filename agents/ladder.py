@@ -7,26 +7,19 @@ most 1.1 times the rung's (nobody survives by staying away), and every larger ru
 
 from __future__ import annotations
 
-import functools
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
-from joblib import Parallel, delayed, parallel_config
-
-from agents import catalogue
 from agents.controller import Controller
 from agents.metrics import Interval, Summary, summarise
 from agents.records import Record
-from agents.rollout import run
-from magenv.params import InputError, require
+from agents.results import Table
+from agents.sharing import run_shared
 
 LADDER_MM = (60.0, 50.0, 45.0, 40.0, 35.0, 30.0, 27.5, 25.0, 22.5, 21.0, 20.0, 19.0, 18.0, 16.0, 14.0)
 """Separations of the rungs, from the top."""
-FILE = "ladder.json"
 SURVIVED_RATE = 0.95
 """Least rate of success on a rung that is survived."""
 APART = 1.1
@@ -49,7 +42,11 @@ class Ladder:
 
     def scenario(self, separation_mm: float) -> str:
         """Return the name of a rung's scenario."""
-        return f"approach-{separation_mm:g}{'-anti' if self.anti else ''}"
+        return _scenario(separation_mm, self.anti)
+
+
+def _scenario(separation_mm: float, anti: bool) -> str:
+    return f"approach-{separation_mm:g}{'-anti' if anti else ''}"
 
 
 @dataclass(frozen=True)
@@ -80,6 +77,14 @@ class Rung:
     survived: bool
     """Success, no staying away, and every larger rung survived too."""
 
+    @property
+    def scenario(self) -> str:
+        """Name of the scenario."""
+        return _scenario(self.separation_mm, self.anti)
+
+
+TABLE = Table("ladder", "rungs", Rung)
+
 
 def climb(
     controller: Controller,
@@ -101,8 +106,7 @@ def climb(
     ladder : Ladder
         What all rungs have in common.
     jobs : int
-        Processes among which the episodes of a rung are shared; with more than one, ``controller`` is made anew in each
-        by its name. Results do not depend on it, but for the wall times.
+        Processes among which the episodes of a rung are shared (see ``sharing``).
     known : mapping, optional
         Rungs of an earlier climb, by separation (mm); they are not run again.
     keep : callable, optional
@@ -119,7 +123,8 @@ def climb(
     for separation_mm in LADDER_MM:
         rung = (known or {}).get(separation_mm)
         if rung is None:
-            records = _episodes(controller, ladder, ladder.scenario(separation_mm), jobs, progress)
+            shared = (ladder.plant, ladder.n_epm, ladder.control_hz, ladder.episodes, ladder.seed)
+            records = run_shared(controller, ladder.scenario(separation_mm), *shared, jobs, progress)
             (summary,) = summarise(records)
             rung = _rung(summary, ladder.anti, separation_mm, rungs)
             if keep is not None:
@@ -134,40 +139,6 @@ def finished(rungs: Sequence[Rung]) -> bool:
     """Return whether a climb has come to its end: to the last rung, or to the second in succession without success."""
     two = [rung.success_rate for rung in rungs[-2:]]
     return two == [0.0, 0.0] or (len(rungs) > 0 and rungs[-1].separation_mm == LADDER_MM[-1])
-
-
-def _episodes(
-    controller: Controller,
-    ladder: Ladder,
-    scenario: str,
-    jobs: int,
-    progress: Callable[[Record], object] | None,
-) -> list[Record]:
-    """Return the records of a rung, in the order of their seeds."""
-    if jobs == 1:
-        shared = (ladder.plant, ladder.n_epm, ladder.control_hz, ladder.episodes, ladder.seed)
-        return run(controller, scenario, *shared, progress)
-    records = []
-    with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
-        seeds = range(ladder.seed, ladder.seed + ladder.episodes)
-        calls = (delayed(_episode)(controller.name, ladder, scenario, seed) for seed in seeds)
-        for record in Parallel(return_as="generator")(calls):
-            records.append(record)
-            if progress is not None:
-                progress(record)
-    return records
-
-
-def _episode(name: str, ladder: Ladder, scenario: str, seed: int) -> Record:
-    """Return the record of one episode, in a process that has nothing but the controller's name."""
-    controller = _controller(name, ladder.n_epm, ladder.control_hz, ladder.plant)
-    (record,) = run(controller, scenario, ladder.plant, ladder.n_epm, ladder.control_hz, episodes=1, seed=seed)
-    return record
-
-
-@functools.lru_cache(maxsize=1)
-def _controller(name: str, n_epm: int, control_hz: float, plant: str) -> Controller:
-    return catalogue.controller(name, n_epm, control_hz, plant)
 
 
 def _rung(summary: Summary, anti: bool, separation_mm: float, above: Sequence[Rung]) -> Rung:
@@ -198,39 +169,6 @@ def survivable(rungs: Sequence[Rung]) -> float | None:
     return min((rung.separation_mm for rung in rungs if rung.survived), default=None)
 
 
-# The type of a field, as it stands above, and what JSON makes of it.
-_KINDS: dict[str, tuple[type, ...]] = {
-    "str": (str,),
-    "int": (int,),
-    "bool": (bool,),
-    "float": (int, float),
-    "float | None": (int, float, NoneType),
-    "Interval": (list,),
-}
-
-
 def load(path: Path) -> tuple[dict[str, Any], list[Rung]]:
-    """Read a ``ladder.json``: the file but its rungs, and the rungs in the order of the file.
-
-    Raises
-    ------
-    ValueError
-        If there is no such file, or it is no ladder.
-    """
-    try:
-        file = json.loads(path.read_text(encoding="utf-8"))
-        return file, [_read(entry) for entry in file.pop("rungs")]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f"Input ladder must be a folder with a {FILE} of evaluate.py --ladder; instead received {str(path)!r}."
-        ) from error
-
-
-def _read(entry: dict[str, Any]) -> Rung:
-    """Return a rung from its entry; raises where the entry is none."""
-    for field in fields(Rung):
-        value, kind = entry[field.name], str(field.type)
-        fits = isinstance(value, _KINDS[kind]) and isinstance(value, bool) == (kind == "bool")
-        require(fits, field.name, f"of type {kind}", value)
-    low, high = map(float, entry["success_rate_ci"])
-    return Rung(**entry | {"success_rate_ci": (low, high)})
+    """Read a ``ladder.json``: the file but its rungs, and the rungs in the order of the file (see ``Table.load``)."""
+    return TABLE.load(path)

@@ -17,7 +17,7 @@ from matplotlib.transforms import ScaledTranslation
 from tyro.conf import Positional
 
 from agents.figures import DPI, HOLDABLE_MM, colour_of, png
-from agents.ladder import APART, FILE, LADDER_MM, SURVIVED_RATE, Rung, finished, load, survivable
+from agents.ladder import APART, LADDER_MM, SURVIVED_RATE, TABLE, Rung, finished, load, survivable
 from magenv.command import friendly, parse
 from magenv.files import check_output_dir, write_file
 from magenv.params import plant_named, require
@@ -173,7 +173,7 @@ def main() -> None:
     """Read, draw, print."""
     config = parse(FiguresConfig)
     require(len(config.folders) > 0, "folders", "one or more with ladder.json", list(map(str, config.folders)))
-    rungs = [rung for folder in config.folders for rung in load(folder / FILE)[1]]
+    rungs = [rung for folder in config.folders for rung in load(folder / TABLE.file)[1]]
     picture = png(draw(rungs))
     check_output_dir(config.out.parent)
     write_file(config.out, picture)

@@ -17,7 +17,7 @@ from messages import told as message
 from PIL import Image
 from recorded import STEPS, a_record
 
-from agents import ladder, ladder_figures, ladder_run
+from agents import ladder, ladder_figures, ladder_run, sharing
 from agents.catalogue import controller
 from agents.controller import Idle, Random
 from agents.figures import colour_of
@@ -73,7 +73,7 @@ class Told:
 def rollout(monkeypatch: pytest.MonkeyPatch) -> Told:
     """Let episodes end as told instead of running them; the pictures of ``run_ladder``, which take time, are empty."""
     instead = Told()
-    monkeypatch.setattr(ladder, "run", instead)
+    monkeypatch.setattr(sharing, "run", instead)
     monkeypatch.setattr(ladder_run, "draw", lambda _: None)
     monkeypatch.setattr(ladder_run, "png", lambda _: b"")
     return instead
