@@ -17,7 +17,10 @@ from agents.catalogue import controller, defaults, names
 from agents.comparison import compare
 from agents.ladder import Ladder
 from agents.ladder_run import run_ladder
+from agents.robustness import Sweep
+from agents.robustness_run import run_robustness
 from magenv.command import command_line, friendly, parse
+from magenv.params import require
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,9 @@ class EvaluateConfig:
 
     controllers: tuple[str, ...] | None = None
     """Names (see --list) or folders of trained models; by default baseline, tuned and the shipped agents that fit."""
-    scenarios: tuple[str, ...] = ("approach-60", "approach-30")
-    """approach-<s>, approach-<s>-anti with s in mm, or random."""
+    scenarios: tuple[str, ...] | None = None
+    """approach-<s>, approach-<s>-anti with s in mm, or random; by default approach-60, and but for --robustness
+    approach-30."""
     plant: str = "paper"
     """Plant acted on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
@@ -40,10 +44,13 @@ class EvaluateConfig:
     """Of the first episode; the others follow."""
     ladder: Literal["none", "parallel", "anti"] = "none"
     """Climb down the ladder of separations instead of the scenarios, with parallel or opposite headings."""
+    robustness: bool = False
+    """Score success on plants that are worse than the one for which the controllers are made: noise, latency, mismatch,
+    disturbance, slow EPMs."""
     jobs: int = 1
-    """Processes that share the episodes of the ladder."""
+    """Processes that share the episodes of --ladder or --robustness."""
     out: Path | None = None
-    """Folder of the report, by default runs/evaluate; of a ladder runs/ladder, where one broken off goes on."""
+    """Folder of the report, by default runs/evaluate; runs/ladder or runs/robustness, where one broken off goes on."""
     list: bool = False
     """Print the known controllers, one name a line, and stop."""
 
@@ -54,15 +61,22 @@ def main() -> None:
     if c.list:
         print("\n".join(names()))
         return
+    require(not c.robustness or c.ladder == "none", "robustness", "without --ladder", f"--ladder {c.ladder}")
     if c.controllers is None:
         chosen, unfit = defaults(c.n_epm, c.control_hz)
         for reason in unfit:
             print(f"left out: {reason}", file=sys.stderr)
     else:
         chosen = [controller(name, c.n_epm, c.control_hz, c.plant) for name in c.controllers]
-    if c.ladder == "none":
+    if c.robustness:
+        sweep = Sweep(
+            c.plant, c.n_epm, c.control_hz, ("approach-60",) if c.scenarios is None else c.scenarios, c.episodes, c.seed
+        )
+        run_robustness(chosen, sweep, c.jobs, c.out or Path("runs/robustness"), command_line())
+    elif c.ladder == "none":
         out = c.out or Path("runs/evaluate")
-        compare(chosen, c.scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, out, command_line())
+        scenarios = ("approach-60", "approach-30") if c.scenarios is None else c.scenarios
+        compare(chosen, scenarios, c.plant, c.n_epm, c.control_hz, c.episodes, c.seed, out, command_line())
     else:
         ladder = Ladder(c.plant, c.n_epm, c.control_hz, c.ladder == "anti", c.episodes, c.seed)
         run_ladder(chosen, ladder, c.jobs, c.out or Path("runs/ladder"), command_line())
