@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from agents.controller import RowGenerators
 from agents.pid import Gains, PIDState, pid_wrench
 from magenv.actions import ActionMode, planar_target, pose_to_action
-from magenv.allocation import Solution, allocate
-from magenv.outcome import outcome_of
-from magenv.params import Plant, System, TaskParams
+from magenv.allocation import allocate
+from magenv.outcome import FELL_BACK, outcome_of
+from magenv.params import InputError, Plant, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.task import Frame, Layout, ObservationMode, unpack
 from magenv.wrench import WRENCH_SIZE, planar_moments
@@ -92,26 +92,37 @@ class Baseline:
         desired = pid_wrench(parts.error, state.pid, self._gains, self._period_s)
         rows = zip(desired, parts.robots, present, self._rngs.of(len(batch)), strict=True)
         found = [self._allocate(*row) for row in rows]
-        state.solver[:] = [outcome_of(solution.relative_residual) for solution in found]
-        actions = np.stack([pose_to_action(solution.pose, self._system) for solution in found])
+        state.solver[:] = [outcome for _, outcome in found]
+        actions = np.stack([pose_to_action(pose, self._system) for pose, _ in found])
         return actions.reshape(*np.shape(observation)[:-1], -1), state
 
-    def _allocate(self, desired: Floats, robots: Floats, present: Floats, rng: np.random.Generator) -> Solution:
-        """Return EPM poses for planar wrenches (2, 3) on robots (2, 3), out-of-plane components zero."""
+    def _allocate(
+        self, desired: Floats, robots: Floats, present: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, int]:
+        """Return EPM poses for planar wrenches (2, 3) on robots (2, 3), out-of-plane components zero; how that ended.
+
+        The present poses are held where there is nothing to be found.
+        """
         target = np.empty(WRENCH_SIZE)
         planar_target(desired.reshape(-1), robots[0, 2], robots[1, 2], target)
         positions = np.zeros((2, 3))
         positions[:, :2] = robots[:, :2]
-        return allocate(
-            target,
-            positions,
-            planar_moments(robots[:, 2], self._system.ipm_moment_am2),
-            self._system,
-            starts=STARTS,
-            seed=rng,
-            initial=present if self._warm_start else None,
-            stop_early=self._warm_start,
-        )
+        moments = planar_moments(robots[:, 2], self._system.ipm_moment_am2)
+        try:
+            found = allocate(
+                target,
+                positions,
+                moments,
+                self._system,
+                starts=STARTS,
+                seed=rng,
+                initial=present if self._warm_start else None,
+                stop_early=self._warm_start,
+            )
+        except InputError:  # robots measured on the same spot, or a state that is not finite
+            return present, FELL_BACK
+        outcome = outcome_of(found.relative_residual)
+        return (present if outcome == FELL_BACK else found.pose), outcome
 
 
 def paper_baseline(n_epm: int = 2, control_hz: float = 2.0) -> Baseline:

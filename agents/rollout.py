@@ -101,10 +101,10 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
         before = time.perf_counter()
         actions, state = controller.predict(observation[None], state, start, deterministic=True)
         step_ms.append(1e3 * (time.perf_counter() - before))
-        solver.append(NO_SOLVER if getattr(state, "solver", None) is None else int(state.solver[0]))
         start = np.zeros(1, np.bool_)
         observation, _, terminated, truncated, info = env.step(actions[0])
         ended = terminated or truncated
+        solver.append(info["solver"] if controller.action == "wrench" else _solver(state))
         states.append(info)
         holds.append(info)
     time_s = _stack(states, "time_s")
@@ -129,6 +129,12 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
         solver=np.array(solver),
         step_ms=np.array(step_ms),
     )
+
+
+def _solver(state: Any) -> int:
+    """Return what a controller's state tells of how its solver ended."""
+    told = getattr(state, "solver", None)
+    return NO_SOLVER if told is None else int(told[0])
 
 
 def _stack(infos: list[dict[str, Any]], name: str) -> NDArray[Any]:

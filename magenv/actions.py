@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from magenv.allocation import component_scales
 from magenv.home import home_epms, home_rows, start_rows
 from magenv.kernels import kernel, typed
+from magenv.outcome import FELL_BACK, outcome_of
 from magenv.params import System, require
 from magenv.poses import (
     EPM_SIZE,
@@ -40,6 +41,7 @@ from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 ActionMode = Literal["home", "pose", "step", "wrench"]
 
 STEP_ANGLE_RAD = 0.3
@@ -138,8 +140,13 @@ def wrench_rows(
     limits: Floats,
     targets: Floats,
     projected: Bools,
+    solver: Integers,
 ) -> None:
-    """Write the EPMs (n, N, 6) that exert the wrenches ``actions`` (n, 6), as found from ``starts`` (k, 5 N)."""
+    """Write the EPMs (n, N, 6) that exert the wrenches ``actions`` (n, 6), as found from ``starts`` (k, 5 N).
+
+    Writes into ``solver`` (n,) how that ended, codes into ``outcome.OUTCOMES``. Where nothing is found, ``targets``
+    stay as they are: the last command. What is found is never worse, since the present poses are the first start.
+    """
     n_epm = targets.shape[1]
     size = POSE_SIZE * n_epm
     positions, moments = np.zeros((2, 3)), np.zeros((2, 3))
@@ -162,7 +169,7 @@ def wrench_rows(
             poses[1, POSE_SIZE * k] += frame
             poses[1, POSE_SIZE * k + 3] += frame
             epm_to_pose(epms[i, k], poses[0, POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE])
-        best_of(
+        cost, _, _, _ = best_of(
             target,
             positions,
             moments,
@@ -176,6 +183,10 @@ def wrench_rows(
             best_pose,
             best_wrench,
         )
+        solver[i] = outcome_of(math.sqrt(2.0 * cost))
+        if solver[i] == FELL_BACK:
+            projected[i] = False
+            continue
         for k in range(n_epm):
             pose_to_epm(best_pose[POSE_SIZE * k : POSE_SIZE * k + POSE_SIZE], targets[i, k])
         projected[i] = project_within(targets[i], limits)
@@ -242,14 +253,25 @@ class Actions:
             Where a command is wanted; elsewhere the answer is undefined.
         """
         active = np.ones(len(epms), np.bool_) if active is None else active
-        targets, projected = np.empty(epms.shape), np.empty(len(epms), np.bool_)
-        self.command(actions, np.ascontiguousarray(measured), np.ascontiguousarray(epms), active, targets, projected)
+        targets, projected, solver = np.array(epms), np.empty(len(epms), np.bool_), np.zeros(len(epms), np.int64)
+        present = np.ascontiguousarray(epms)
+        self.command(actions, np.ascontiguousarray(measured), present, active, targets, projected, solver)
         return targets, projected
 
     def command(
-        self, actions: Floats, measured: Floats, epms: Floats, active: Bools, targets: Floats, projected: Bools
+        self,
+        actions: Floats,
+        measured: Floats,
+        epms: Floats,
+        active: Bools,
+        targets: Floats,
+        projected: Bools,
+        solver: Integers,
     ) -> None:
-        """Write what ``to_epms`` returns into ``targets`` (n, N, 6) and ``projected`` (n,), in active rows alone."""
+        """Write what ``to_epms`` returns into ``targets`` (n, N, 6) and ``projected`` (n,), in active rows alone.
+
+        ``targets`` hold the last commands, and ``solver`` (n,) is written by ``wrench_rows`` alone.
+        """
         n, run = len(epms), self._workers.run
         if self.mode == "home":
             run(home_rows, n, active, actions, measured, self._home, self._limits, targets, projected)
@@ -272,6 +294,7 @@ class Actions:
                 self._limits,
                 targets,
                 projected,
+                solver,
             )
 
 

@@ -38,7 +38,9 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | ``step`` | change of the present pose: angles +-0.3 rad, radius +-50 mm |
     | ``wrench`` | ``Box(-1, 1, (6,))``: F_x, F_y (20 mN), tau_z (1 mN m) per robot, global frame |
 
-    Wrenches are turned into poses by ``magenv.allocation``.
+    Wrenches are turned into poses by ``magenv.allocation``; ``info["solver"]``, in this mode alone, is a code into
+    ``magenv.outcome.OUTCOMES``: whether they are exerted to a tenth, whether the nearest in reach misses them, or
+    whether nothing was found and the EPMs stay where they were commanded to last.
 
     EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart, those that
     would be out of their arms' reach are moved within it; ``info["projected"]`` says so.

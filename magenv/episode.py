@@ -30,6 +30,7 @@ class Episode:
         types = (type_of(self._packed),)
         self._step, self._begin = step.compile(types), begin.compile(types)
         self._draw = functools.partial(episodes.draw, state.every)
+        self._solves = episodes.settings.action == "wrench"
         self._action = state.action[0]
         self._shape = self._action.shape
         self._observation = state.observation[0].copy
@@ -79,6 +80,7 @@ class Episode:
             reward_position,
             reward_heading,
             projected,
+            solver,
         ) = self._step(self._packed)
         if not fit:
             check_action(action, self._shape)
@@ -99,4 +101,6 @@ class Episode:
             "reward_heading": reward_heading,
             "projected": projected,
         }
+        if self._solves:
+            info["solver"] = solver
         return self._observation(), reward, terminated, truncated, info

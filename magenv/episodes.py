@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from magenv.actions import ActionMode, Actions
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, POSE_SIZE
+from magenv.random_knots import RANDOM_EXTENT
 from magenv.reach import Shell
 from magenv.starts import Starts, holding_epms
 from magenv.state import State, packed
 from magenv.steps import begin_episodes, clip, step_kernel, tell_rows
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode
-from magenv.trajectories import named_trajectory
+from magenv.trajectories import extent, named_trajectory
 from magenv.uncertainty import is_uncertain, nominal
 from magenv.workers import Workers
-from magenv.world import Measurements, World
+from magenv.world import Measurements, World, check_extent
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -102,6 +103,8 @@ class Episodes:
         )
         self._workers = Workers(threads)
         self.actions = Actions(settings.action, self.system, self._workers, Shell.of(self.system, plant))
+        reach_and_gap = RANDOM_EXTENT if trajectory is None else extent(trajectory)
+        check_extent(reach_and_gap, plant, "scenario", f"{settings.scenario!r} on {settings.plant!r}")
         self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
         bounds = self.layout.bounds()
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
@@ -152,6 +155,7 @@ class Episodes:
             noise_heading=plant.noise_heading_rad,
             targets=np.zeros(w.epms.shape),
             projected=np.zeros(n, np.bool_),
+            solver=np.zeros(n, np.int64),
             **self.actions.constants(),
             offsets=self._starts.offsets,
             used=self._starts.used,
@@ -247,7 +251,11 @@ class Episodes:
         }
 
     def step_info(self) -> dict[str, NDArray[Any]]:
-        """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated."""
+        """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated.
+
+        In the ``wrench`` mode also how the allocation ended.
+        """
         s = self.state
         values = (*s.numbers.copy(), *s.counts.copy(), *s.paid[:-1].copy(), s.projected.copy())
-        return dict(zip(_STEP_KEYS, values, strict=True))
+        info = dict(zip(_STEP_KEYS, values, strict=True))
+        return info | {"solver": s.solver.copy()} if self.actions.mode == "wrench" else info

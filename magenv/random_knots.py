@@ -17,6 +17,8 @@ _AXES = 6  # x, y, heading of both robots
 RANDOM_SEPARATION_M = (0.025, 0.100)
 """Range of the least separation in the random family."""
 _RANDOM_RADIUS_M = 0.082
+RANDOM_EXTENT = _RANDOM_RADIUS_M, RANDOM_SEPARATION_M[0]
+"""Greatest distance of a knot from the workspace's centre, least of the robots from each other, m."""
 _RANDOM_SPEED_MIN_MPS = 2e-4
 RANDOM_TURN_MAX_RADPS = 0.1
 

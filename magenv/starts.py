@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magenv.allocation import allocate
 from magenv.kernels import kernel
-from magenv.params import System, require
+from magenv.params import InputError, System, require
 from magenv.poses import POSE_SIZE, home_pose, robots_frame, to_cartesian
 from magenv.reach import COMMAND_MARGIN_M, Shell, beyond_reach, narrowed
 from magenv.trajectories import draw_keys, draw_rows, random_limits, reference_of, trajectory_of
@@ -26,6 +26,10 @@ _TURNS = 100
 """Searches for poses within reach that hold the robots."""
 _FARTHEST = np.array([1.0, 1.0, 0.1, 1.0, 1.0])
 """Standard deviation of the last one's start from home, per coordinate of a pose."""
+
+
+HELD = 2e-5
+"""Residual of a hold, over 0.5 N and 0.05 N m: 0.01 mN moves a robot by 0.07 mm in a second."""
 
 
 @kernel
@@ -86,12 +90,15 @@ def holding_epms(reference: Floats, system: System, shell: Shell) -> Floats:
             stop_early=True,
             components=IN_PLANE,
         )
-        epms = np.concatenate(to_cartesian(held.pose), axis=-1)
-        found = shell.outer == math.inf or (held.status == "converged" and beyond_reach(epms, within, False) == 0.0)
-        if found:
-            break
-    require(found, "arm_reach_m", "so large that EPMs within reach hold the robots at the start", shell.outer)
-    return epms
+        epms, holds = np.concatenate(to_cartesian(held.pose), axis=-1), held.residual < HELD
+        if holds and (shell.outer == math.inf or beyond_reach(epms, within, False) == 0.0):
+            return epms
+    least = "one at whose start EPMs can hold the robots"
+    require(shell.outer < math.inf, "reference", least, reference.round(6).tolist())
+    raise InputError(
+        "Input arm_reach_m must be so large that EPMs within reach hold the robots at the start; instead received "
+        f"{shell.outer!r}."
+    )
 
 
 class Starts:

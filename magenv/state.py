@@ -80,6 +80,8 @@ class State(NamedTuple):
     """(n, N, 6) commanded EPMs."""
     projected: Bools
     """(n,) whether the least gap or reach made them differ from the action."""
+    solver: Integers
+    """(n,) how the allocation of a ``wrench`` ended, codes into ``outcome.OUTCOMES``; else 0."""
     home: Floats
     """(5 N,) pose at home."""
     low: Floats

@@ -76,6 +76,7 @@ def _wrench(first: int, last: int, active: Bools, actions: Floats, s: State) -> 
         s.limits,
         s.targets,
         s.projected,
+        s.solver,
     )
 
 
@@ -182,8 +183,11 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
         s.counts,
     )
     projected, measured, before, stream = s.projected, s.measured, s.before, np.empty(1, np.uint64)
+    present, targets = s.epms, s.targets
     for i in range(first, last):
         projected[i] &= not mask[i]
+        if mask[i]:
+            targets[i] = present[i]  # what is held until something else is commanded
         if mask[i] and s.uncertain:
             add_noise(measured, i, s.plant_key[i], 0, s.noise_position, s.noise_heading, stream)
             before[i] = measured[i]
@@ -330,6 +334,7 @@ def one_kernel(
             paid[0, 0],
             paid[1, 0],
             s.projected[0],
+            s.solver[0],
         )
 
     return kernel(step_one)

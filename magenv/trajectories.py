@@ -45,6 +45,9 @@ class Trajectory:
     @classmethod
     def through(cls, duration_s: float, knots: Floats) -> Trajectory:
         """Return the twice continuously differentiable spline through ``knots`` (33, 2, 3), equally spaced in time."""
+        fits = np.shape(knots) == (_KNOTS, 2, 3) and bool(np.isfinite(knots).all())
+        require(fits, "knots", f"a finite array of shape {(_KNOTS, 2, 3)}", np.shape(knots))
+        require(0.0 < duration_s < math.inf, "duration_s", "a positive, finite number", duration_s)
         coefficients = np.empty((SEGMENTS, 2, 3, 4))
         spline_through(np.ascontiguousarray(knots), np.empty((SEGMENTS + 1, 2, 3)), coefficients)
         return cls(duration_s, coefficients)
@@ -54,6 +57,14 @@ class Trajectory:
         out = np.empty((2, 3))
         reference_kernel(self.coefficients, self.duration_s, float(time_s), out)
         return out
+
+
+def extent(trajectory: Trajectory) -> tuple[float, float]:
+    """Return how far the references go from the workspace's centre, and how near they come to each other, m."""
+    times = np.linspace(0.0, trajectory.duration_s, 8 * SEGMENTS + 1)
+    places = np.stack([trajectory.at(time)[:, :2] for time in times.tolist()])
+    reach, gap = np.hypot(places[..., 0], places[..., 1]), np.hypot(*(places[:, 1] - places[:, 0]).T)
+    return float(reach.max()), float(gap.min())
 
 
 @law

@@ -15,9 +15,9 @@ from magenv.dynamics import Physics, constants
 from magenv.hold import AT_ONCE, LATE, LOSSES, TRAVELLING, hold_kernel
 from magenv.kernels import kernel, law
 from magenv.lanes import CONSTANTS_SIZE, ROUTE_SIZE
-from magenv.params import Plant, System, TaskParams
+from magenv.params import Plant, System, TaskParams, require
 from magenv.poses import EPM_SIZE, POSE_SIZE, epms_to_poses
-from magenv.trajectories import SEGMENTS, Trajectory, reference_of, trajectory_of
+from magenv.trajectories import SEGMENTS, Trajectory, extent, reference_of, trajectory_of
 from magenv.travel import Motion
 from magenv.workers import Workers
 
@@ -73,6 +73,14 @@ class Measurements:
             )
             return row
         raise AttributeError(name)
+
+
+def check_extent(reach_and_gap: tuple[float, float], plant: Plant, name: str, received: object) -> None:
+    """Raise ``ValueError`` unless bodies fit that go so far from the workspace's centre, so near to each other (m)."""
+    (reach, gap), width = reach_and_gap, plant.body.diameter_m
+    must_be = f"such that bodies {1e3 * width:g} mm wide keep off each other and the wall at "
+    must_be += f"{1e3 * plant.workspace_radius_m:g} mm"
+    require(reach + 0.5 * width < plant.workspace_radius_m and gap > width, name, must_be, received)
 
 
 @law
@@ -198,6 +206,9 @@ class World:
         trajectory: Trajectory | None = None,
         workers: Workers | None = None,
     ) -> None:
+        if trajectory is not None:
+            check_extent(extent(trajectory), plant, "trajectory", extent(trajectory))
+        self._plant = plant
         self.physics = Physics.of(system, plant, n)
         self.period_s = task.period_s
         # As many equal substeps as fit, none longer than the plant's.
@@ -249,7 +260,20 @@ class World:
         )
 
     def start(self, row: int, trajectory: Trajectory, robots: Floats, epms: Floats) -> None:
-        """Begin an episode in ``row``, which has a trajectory of its own, with given states (2, 6) and EPMs (N, 6)."""
+        """Begin an episode in ``row``, which has a trajectory of its own, with given states (2, 6) and EPMs (N, 6).
+
+        Raises
+        ------
+        ValueError
+            If states or EPMs are not such arrays of finite numbers, or the bodies do not fit at the start or on their
+            references.
+        """
+        for name, value, shape in (("robots", robots, (2, 6)), ("epms", epms, self.epms.shape[1:])):
+            fits = np.shape(value) == shape and bool(np.isfinite(value).all())
+            require(fits, name, f"a finite array of shape {shape}", np.shape(value))
+        check_extent(extent(trajectory), self._plant, "trajectory", extent(trajectory))
+        reach, gap = float(np.hypot(*robots[:, :2].T).max()), math.dist(robots[0, :2], robots[1, :2])
+        check_extent((reach, gap), self._plant, "robots", robots[:, :2].tolist())
         self.robots[row] = robots
         self.epms[row] = epms
         self.coefficients[row] = trajectory.coefficients

@@ -17,8 +17,12 @@ from rollouts import MODES, MakeEnv
 import magenv
 from magenv.actions import ActionMode
 from magenv.env import TwoRobots
-from magenv.params import Plant
+from magenv.home import home_epms
+from magenv.params import PLANTS, Plant, System, TaskParams
+from magenv.starts import holding_epms
+from magenv.trajectories import Trajectory, approach
 from magenv.vector_env import TwoRobotsVector
+from magenv.world import World
 
 SCENARIOS = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
 CONTROL_HZ = "a number from 0.01 to 1000.0"
@@ -215,3 +219,71 @@ def test_reset_mask(mask: Any) -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=told("reset_mask", "2 booleans, one of them true", mask)):
         env.reset(options={"reset_mask": mask})
+
+
+# What robots cannot reach.
+
+
+NARROW = "such that bodies 11 mm wide keep off each other and the wall at 80 mm"
+
+
+@pytest.mark.parametrize("scenario", ["approach-60", "approach-12-anti", "random"])
+def test_a_scenario_that_leaves_the_workspace(scenario: str) -> None:
+    plant = "paper:workspace_radius_m=0.08"
+    received = f"{scenario!r} on {plant!r}"
+    for make in (TwoRobots, lambda **arguments: TwoRobotsVector(2, **arguments)):
+        with pytest.raises(ValueError, match=told("scenario", NARROW, received)):
+            make(scenario=scenario, plant=plant)
+    TwoRobots(scenario=scenario, plant="paper:workspace_radius_m=0.09")
+
+
+def a_world(**changes: Any) -> World:
+    return World(1, System(), dataclasses.replace(PLANTS["paper"], **changes), TaskParams())
+
+
+def test_a_trajectory_that_leaves_the_workspace() -> None:
+    far, meeting = approach(0.06), approach(0.06)
+    far.coefficients[..., 0, :] *= 1.6
+    meeting.coefficients[:, :, 1] = 0.0
+    for trajectory in (far, meeting):
+        with pytest.raises(ValueError, match=r"^Input trajectory must be such that bodies 11 mm wide keep off each"):
+            World(1, System(), PLANTS["paper"], TaskParams(), trajectory)
+        with pytest.raises(ValueError, match=r"^Input trajectory must be such that bodies 11 mm wide keep off each"):
+            a_world().start(0, trajectory, np.zeros((2, 6)), home_epms(2))
+
+
+@pytest.mark.parametrize(
+    ("robots", "epms", "message"),
+    [
+        ([[-0.1, 0, 0], [0.06, 0, 0]], None, "robots must be such that bodies 11 mm wide keep off each other"),
+        ([[0.01, 0, 0], [0.02, 0, 0]], None, "robots must be such that bodies 11 mm wide keep off each other"),
+        ([[np.nan, 0, 0], [0.06, 0, 0]], None, r"robots must be a finite array of shape \(2, 6\)"),
+        ([[-0.06, 0, 0]], None, r"robots must be a finite array of shape \(2, 6\)"),
+        ([[-0.06, 0, 0], [0.06, 0, 0]], np.full((2, 6), np.inf), r"epms must be a finite array of shape \(2, 6\)"),
+        ([[-0.06, 0, 0], [0.06, 0, 0]], np.zeros((3, 6)), r"epms must be a finite array of shape \(2, 6\)"),
+    ],
+)
+def test_a_start_that_cannot_be(robots: Any, epms: Any, message: str) -> None:
+    states = np.pad(np.array(robots, dtype=float), ((0, 0), (0, 3)))
+    world = a_world()
+    with pytest.raises(ValueError, match="^Input " + message):
+        world.start(0, approach(0.06), states, home_epms(2) if epms is None else epms)
+    assert not world.robots.any(), "nothing was put anywhere"
+
+
+@pytest.mark.parametrize("apart_m", [0.011, 0.014])
+def test_a_start_at_which_nothing_holds_the_robots(apart_m: float) -> None:
+    """Side by side, parallel robots nearer than 18.8 mm pull each other with more than any EPMs can."""
+    reference = np.array([[0.0, -0.5 * apart_m, 0.0], [0.0, 0.5 * apart_m, 0.0]])
+    with pytest.raises(ValueError, match=r"^Input reference must be one at whose start EPMs can hold the robots; inst"):
+        holding_epms(reference, System())
+    assert np.isfinite(holding_epms(3 * reference, System())).all()
+
+
+@pytest.mark.parametrize("knots", [np.zeros((33, 2)), np.zeros((32, 2, 3)), np.full((33, 2, 3), np.nan)])
+def test_knots_of_a_trajectory(knots: NDArray[Any]) -> None:
+    with pytest.raises(ValueError, match=r"^Input knots must be a finite array of shape \(33, 2, 3\)"):
+        Trajectory.through(100.0, knots)
+    for duration_s in (0.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match=r"^Input duration_s must be a positive, finite number"):
+            Trajectory.through(duration_s, np.zeros((33, 2, 3)))
