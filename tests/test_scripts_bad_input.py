@@ -31,7 +31,7 @@ BAD = {
     "jobs": ("evaluate.py", ["--controllers", "idle", "--ladder", "anti", "--jobs", "0"], "jobs.*at least 1.*0"),
     "ladder and robustness": ("evaluate.py", ["--ladder", "anti", "--robustness"], "without --ladder.*'--ladder anti'"),
     "robustness on no scenario": ("evaluate.py", ["--controllers", "idle", "--robustness", "--scenarios"], "each once"),
-    "workspace": ("evaluate.py", ["--controllers", "idle", "--plant", "paper:workspace_radius_m=0.05"], "wall at 50"),
+    "workspace": ("evaluate.py", ["--controllers=idle", "--plant=paper:workspace_radius_m=0.05"], "wall at 50"),
     "figures of no ladder": ("agents/ladder_figures.py", ["runs/nothing"], "ladder.json.*'runs/nothing/ladder.json'"),
     "no model": ("evaluate.py", ["--controllers", "runs/nothing"], "model's folder.*'runs/nothing'"),
     "option": ("evaluate.py", ["--controler", "idle"], "--controler"),
