@@ -50,12 +50,11 @@ class Task:
         model, weights = uneven_model(n_epm), WEIGHTS * np.repeat([1.0, 0.2], 6)
         state = on_the_way(0.06, rng.uniform(10.0, 90.0)) + 0.3 * rng.normal(size=STATE) * NATURAL
         before, references, end = at_home(state, n_epm), [], state
-        home = shifted(before, rng.normal(0.0, 0.05, 5 * n_epm), 0.15, 0.5)
         for _ in range(stages):
             command = shifted(before, rng.normal(0.0, 0.12, 5 * n_epm) * np.tile([1, 1, 0.1, 1, 1], n_epm), 0.15, 0.5)
             end = end_of(model, end, PUSH, held(command, SUBSTEPS))
             references.append(end + 0.2 * NATURAL * rng.normal(size=STATE))
-        goal = goal_of(np.array(references), (SUBSTEPS,), weights, home, pull, room=1.0)
+        goal = goal_of(np.array(references), (SUBSTEPS,), weights, before, pull, room=1.0)
         return cls(
             model,
             state,
