@@ -70,6 +70,14 @@ def test_it_holds_five_episodes_of_which_the_tuned_controller_holds_none() -> No
         assert one.heading_error_rad[:held].mean() < other.heading_error_rad[:held].mean()
 
 
+def test_it_holds_with_arms_that_lag_noise_and_magnets_that_are_amiss() -> None:
+    """At 10 Hz on ``arm``; without moments learned and a home the EPMs are drawn to, most episodes are lost."""
+    records = run(Predictive(2, 10.0, "arm"), "approach-60", "arm", control_hz=10.0, episodes=2, seed=0)
+    assert [record.success for record in records] == [True] * 2
+    assert 1e3 * np.mean([record.position_error_m.mean() for record in records]) < 2.0
+    assert not any(record.projected.any() for record in records), "no plan is nearer than the least gap"
+
+
 @pytest.mark.parametrize(("n_epm", "control_hz"), [(3, 2.0), (2, 10.0), (3, 10.0), (2, 0.9)])
 def test_three_epms_and_other_control_rates(make_env: MakeEnv, n_epm: int, control_hz: float) -> None:
     """The error of the beginning is gone after a second, two holds at least, and stays away."""
