@@ -46,6 +46,8 @@ _LOST = 1.0
 """Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
 _PULL = 0.3
 """Weight of the way from home where the EPMs travel: they do not come back from where they can do little."""
+_STAY = 3.0
+"""Weight of the way from the last command, there: else noise drives EPMs to and fro as fast as they can go."""
 _ROOM = 3.0
 """Weight of EPMs that are too near to each other, there."""
 
@@ -158,7 +160,7 @@ class Predictive:
                 memory = self._begin(measured, epms[i])
             else:
                 self._update(memory, measured, epms[i])
-            goal = self._goal(parts.reference[i].reshape(-1, COORDINATES))
+            goal = self._goal(parts.reference[i].reshape(-1, COORDINATES), memory.before)
             state.status[i] = self._decide(memory, goal, epms[i], rng)
             state.rows[i] = memory
             command = memory.commands[0]
@@ -195,8 +197,11 @@ class Predictive:
         self._held.path[: len(path)] = path
         forecast(self._planner.model, self._held, 0, len(path), self._noise, known, covariance)
 
-    def _goal(self, references: Floats) -> Goal:
-        """Return the goal at the ends of the commands' times, from the references (5, 6) told."""
+    def _goal(self, references: Floats, before: Floats) -> Goal:
+        """Return the goal at the ends of the commands' times, from the references (5, 6) told.
+
+        ``before`` (N, 6) is the last command, from which the coming ones do not go farther than serves.
+        """
         turn = np.diff(references, axis=0)
         turn[:, 2::3] = np.remainder(turn[:, 2::3] + math.pi, 2 * math.pi) - math.pi
         rates = np.concatenate([1.5 * turn[:1] - 0.5 * turn[1:2], 0.5 * (turn[:-1] + turn[1:])]) / self._period_s
@@ -207,7 +212,11 @@ class Predictive:
         states = states[: self._stages]
         home, robots = np.empty((len(states), *self._home.shape)), states[:, :COORDINATES].reshape(-1, 2, 3)
         start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
-        pull, room = (0.0, 0.0) if self._plant.epms_jump else (_PULL, _ROOM)
+        if self._plant.epms_jump:
+            pull, room = 0.0, 0.0
+        else:  # two squares, of the way from home and from the last command, are one
+            pull, room = math.hypot(_PULL, _STAY), _ROOM
+            home = before + (_PULL / pull) ** 2 * (home - before)
         return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull, room)
 
     def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:

@@ -19,6 +19,7 @@ from magenv.actions import ActionMode
 from magenv.env import TwoRobots
 from magenv.home import home_epms
 from magenv.params import PLANTS, Plant, System, TaskParams
+from magenv.reach import Shell
 from magenv.starts import holding_epms
 from magenv.trajectories import Trajectory, approach
 from magenv.vector_env import TwoRobotsVector
@@ -275,9 +276,10 @@ def test_a_start_that_cannot_be(robots: Any, epms: Any, message: str) -> None:
 def test_a_start_at_which_nothing_holds_the_robots(apart_m: float) -> None:
     """Side by side, parallel robots nearer than 18.8 mm pull each other with more than any EPMs can."""
     reference = np.array([[0.0, -0.5 * apart_m, 0.0], [0.0, 0.5 * apart_m, 0.0]])
+    system, anywhere = System(), Shell.of(System(), PLANTS["paper"])
     with pytest.raises(ValueError, match=r"^Input reference must be one at whose start EPMs can hold the robots; inst"):
-        holding_epms(reference, System())
-    assert np.isfinite(holding_epms(3 * reference, System())).all()
+        holding_epms(reference, system, anywhere)
+    assert np.isfinite(holding_epms(3 * reference, system, anywhere)).all()
 
 
 @pytest.mark.parametrize("knots", [np.zeros((33, 2)), np.zeros((32, 2, 3)), np.full((33, 2, 3), np.nan)])

@@ -11,6 +11,7 @@ from magenv.forecast import STATE, Course
 from magenv.horizon import Scratch, _backward, _linearise
 from magenv.manoeuvre import Arms
 from magenv.params import Plant, System
+from magenv.poses import project_epms
 
 
 def followed(s: Scratch) -> Floats:
@@ -112,12 +113,22 @@ def test_what_has_no_minimum_has_no_gains(rng: np.random.Generator, arms: Arms) 
     assert not _backward(commands, arms, 0.0, s)
 
 
+@pytest.mark.parametrize("crowded", [False, True])
 @pytest.mark.parametrize("n_epm", [2, 3])
-def test_the_linearisation_is_that_of_cost_and_motion(n_epm: int) -> None:
-    """Derivatives of all residuals by all commands, through the states between them, against differences."""
-    task = Task.draw(3, n_epm, stages=3)
+def test_the_linearisation_is_that_of_cost_and_motion(n_epm: int, crowded: bool) -> None:
+    """Derivatives of all residuals by all commands, through the states between them, against differences.
+
+    Where EPMs are crowded, they stand hardly farther apart than the least gap, and that costs as well.
+    """
+    stages = 1 if crowded else 3  # robots are flung about by EPMs like that
+    task = Task.draw(3, n_epm, stages=stages)
+    if crowded:
+        task.before[0, :3] = task.before[1, :3] + 0.01
+        project_epms(task.before, task.arms.limits.r_min, task.arms.limits.r_max, task.arms.limits.gap + 0.015)
     commands, s, u = task.start(), task.scratch(), 5 * n_epm
-    for command, step in zip(commands, np.random.default_rng(1).normal(0.0, 0.05, (3, u)), strict=True):
+    for command, step in zip(
+        commands, np.random.default_rng(1).normal(0.0, 0.005 if crowded else 0.05, (stages, u)), strict=True
+    ):
         command[:] = shifted(command, step)
     s.states[0] = task.state
     motion = Course.of(n_epm, SUBSTEPS, False)
@@ -125,12 +136,15 @@ def test_the_linearisation_is_that_of_cost_and_motion(n_epm: int) -> None:
     assert scale == 0.0
     assert cost == pytest.approx(task.cost(commands), rel=1e-12)
     residuals, jacobian = joint(s)
-    doubted = np.tile(np.repeat([True, False, True], [STATE, STATE, 6 * n_epm]), 3)
+    pairs = n_epm * (n_epm - 1) // 2
+    doubted = np.tile(np.repeat([True, False, True], [STATE, STATE, 6 * n_epm + pairs]), stages)
+    room = s.residuals[:, -pairs:]
+    assert (room > 0.0).any() == crowded
     np.testing.assert_allclose(residuals[doubted], task.residuals(commands), rtol=1e-9, atol=1e-9)
     assert (jacobian[~doubted] == 0.0).all()
-    for column, e in enumerate(1e-5 * np.eye(3 * u)):
+    for column, e in enumerate(1e-5 * np.eye(stages * u)):
         up, down = (
-            np.stack([shifted(*pair) for pair in zip(commands, sign * e.reshape(3, u), strict=True)])
+            np.stack([shifted(*pair) for pair in zip(commands, sign * e.reshape(stages, u), strict=True)])
             for sign in (1, -1)
         )
         expected = (task.residuals(up) - task.residuals(down)) / 2e-5
