@@ -16,12 +16,12 @@ from agents.controller import RowGenerators
 from agents.planner import ENOUGH, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
-from magenv.home import home_epms, start_rows
+from magenv.home import start_rows
 from magenv.observer import MOMENTS, Noise, correct, forecast
 from magenv.outcome import CONVERGED as SOLVED
 from magenv.outcome import FELL_BACK, NOT_CONVERGED
 from magenv.params import Plant, System, TaskParams, plant_named, require
-from magenv.poses import POSE_SIZE, from_cartesian
+from magenv.poses import POSE_SIZE, from_cartesian, ring
 from magenv.sensitivity import COORDINATES, believe
 from magenv.task import Frame, Layout, ObservationMode, unpack
 
@@ -44,8 +44,11 @@ _START_MPS, _START_RADPS = 1e-3, 1e-3
 
 _LOST = 1.0
 """Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
-_PULL = 0.3
-"""Weight of the way from home where the EPMs travel: they do not come back from where they can do little."""
+_HOME_RADIUS_M, _HOME_TILT_RAD = 0.16, math.radians(62.0)
+"""Where EPMs that travel are drawn to, in the robots' frame: broadside, near, and steep. By Earnshaw's theorem no hold
+is stable in all directions; from above and below the unstable one is nearly the vertical, which the plane bears."""
+_PULL = 0.6
+"""Weight of the way from there: EPMs do not come back by themselves from where they can do little."""
 _STAY = 3.0
 """Weight of the way from the last command, there: else noise drives EPMs to and fro as fast as they can go."""
 _ROOM = 3.0
@@ -118,7 +121,7 @@ class Predictive:
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
         self._stages = min(4, max(1, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
-        self._home = home_epms(n_epm)
+        self._home = ring(n_epm, _HOME_RADIUS_M, _HOME_TILT_RAD)
         self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
         require(
