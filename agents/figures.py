@@ -88,7 +88,9 @@ def paths(records: list[Record]) -> Figure:
         axes.set_xlabel("x (mm)")
         if index % columns == 0:
             axes.set_ylabel("y (mm)")
-    figure.suptitle(f"{_title(records)}: paths of both robots", fontsize=12)
+    narrow = columns == 1
+    between = "\n" if narrow else " "
+    figure.suptitle(f"{_title(records)}:{between}paths of both robots", fontsize=12)
     handles = [
         Line2D([], [], color=_INK, linestyle=(0, (4, 3)), linewidth=1.1, label="reference"),
         Line2D([], [], color="#555555", linewidth=2.0, label="typical episode, with headings"),
@@ -96,7 +98,9 @@ def paths(records: list[Record]) -> Figure:
         Line2D([], [], color=_INK, marker="x", markersize=8, markeredgewidth=2, linestyle="", label="control lost"),
         Line2D([], [], color=_INK, linewidth=1.2, label="wall"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(5, 2 + columns), frameon=False, fontsize=9)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=2 if narrow else 2 + columns, frameon=False, fontsize=9
+    )
     return figure
 
 

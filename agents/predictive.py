@@ -213,12 +213,11 @@ class Predictive:
         states[:-1, :COORDINATES] += share * turn[:3]
         states[:-1, COORDINATES:] += share * np.diff(states[:, COORDINATES:], axis=0)
         states = states[: self._stages]
-        home, robots = np.empty((len(states), *self._home.shape)), states[:, :COORDINATES].reshape(-1, 2, 3)
-        start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
-        if self._plant.epms_jump:
-            pull, room = 0.0, 0.0
-        else:  # two squares, of the way from home and from the last command, are one
-            pull, room = math.hypot(_PULL, _STAY), _ROOM
+        home, pull, room = np.repeat(before[None], len(states), axis=0), 0.0, 0.0
+        if not self._plant.epms_jump:
+            robots = states[:, :COORDINATES].reshape(-1, 2, 3)
+            start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
+            pull, room = math.hypot(_PULL, _STAY), _ROOM  # two squares, of the ways from home and from before, are one
             home = before + (_PULL / pull) ** 2 * (home - before)
         return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull, room)
 

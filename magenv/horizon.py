@@ -1,11 +1,11 @@
 """Planning: the EPM poses whose predicted motion of the robots comes nearest to a reference, over several commands.
 
 The cost is that of weighted errors of pose and rates at marked substeps of each command's time, of the commands' ways
-from a home, and of what is not known of the state at the beginning, grown by the first command. It is minimised by the
-Gauss-Newton form of differential dynamic programming: derivatives of each command's time, a Riccati recursion
-backwards, and forwards the motion itself under the feedback that the recursion gives, without which errors grow
-through unstable holds beyond all linearity. Radii are kept within their bounds as an active set, the least gap by
-projection.
+from a home, of EPMs near each other, and of what is not known of the state at the beginning, grown by the first
+command. It is minimised by the Gauss-Newton form of differential dynamic programming: derivatives of each command's
+time, a Riccati recursion backwards, and forwards the motion itself under the feedback that the recursion gives, without
+which errors grow through unstable holds beyond all linearity. Radii are kept within their bounds as an active set, the
+least gap by projection.
 
 References
 ----------
@@ -54,7 +54,7 @@ class Scratch(NamedTuple):
     bases: Floats
     """(H + 1, N, 6, 5) of the command before and of each."""
     residuals: Floats
-    """(H, r): errors, then those of the state's doubt, then the command's way from home."""
+    """(H, r): errors, those of the state's doubt, the command's way from home, and EPMs near each other."""
     jacobians: Floats
     """(H, r, z)"""
     by: Floats
