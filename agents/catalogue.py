@@ -12,7 +12,10 @@ from agents.store import CARD
 from magenv.params import InputError, require
 
 _SHIPPED = Path(__file__).parent / "data"
-_CLASSICAL = ("baseline", "tuned", "predictive", "idle", "random")
+_CLASSICAL = ("baseline", "tuned", "predictive", "predictive-robust", "idle", "random")
+
+_DOUBT = 0.05
+"""Of ``predictive-robust``: share by which its parameters may be off."""
 
 
 def names() -> list[str]:
@@ -35,7 +38,8 @@ def defaults(n_epm: int, control_hz: float) -> tuple[list[Controller], list[str]
 def controller(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper") -> Controller:
     """Return the controller of this name, or the agent in this folder, for a number of EPMs and a control rate.
 
-    ``plant`` names the kind of plant acted on, of which ``predictive`` takes its nominal parameters.
+    ``plant`` names the kind of plant acted on, of which ``predictive`` takes its nominal parameters;
+    ``predictive-robust`` does so, and doubts them.
 
     Raises
     ------
@@ -49,6 +53,8 @@ def controller(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = 
             return tuned_baseline(n_epm, control_hz)
         case "predictive":
             return Predictive(n_epm, control_hz, plant)
+        case "predictive-robust":
+            return Predictive(n_epm, control_hz, plant, name, doubt=_DOUBT)
         case "idle":
             return Idle(n_epm)
         case "random":

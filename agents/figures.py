@@ -25,6 +25,7 @@ _COLOURS = {
     "baseline": "#D55E00",
     "tuned": "#E69F00",
     "predictive": "#009E73",
+    "predictive-robust": "#004D38",
     "ppo": "#0072B2",
     "sac": "#56B4E9",
     "random": "#999999",

@@ -1,7 +1,8 @@
 """Plans for the predictive controller: from the last plan, and where that does not converge, from elsewhere.
 
-Elsewhere are poses that hold the robots on their way by statics; from them, plans are made for longer and longer parts
-of the command's time, in which errors grow less than in the whole of it.
+Elsewhere are poses that hold the robots on their way by statics and, in turn, poses a little beside the best plan;
+from them, plans are made for longer and longer parts of the command's time, in which errors grow less than in the
+whole of it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ ENOUGH = 1.0
 """Cost per command below which a plan is taken without seeking others."""
 TROUBLE = 20.0
 """Cost per command above which more are sought."""
-SEARCHES, MORE_SEARCHES = 16, 60
+SEARCHES, MORE_SEARCHES = 2, 16
+BESIDE_M, BESIDE_RAD = 0.01, 0.05
+"""How far beside the best plan every second search begins: standard deviations of EPMs' positions and directions."""
 LATER_SEARCHES = 3
 """Starts of the later commands of a plan."""
 ITERATIONS, SHORT_ITERATIONS = 15, 8
@@ -82,7 +85,7 @@ class Planner:
         cost = self._polish(problem, best)
         turn = 0
         while not cost < ENOUGH * self._stages and turn < self._searches(cost):
-            new, commands = self._from_statics(problem, cost, rng)
+            new, commands = self._from_elsewhere(problem, best if turn % 2 else None, cost, rng)
             if new < cost:
                 best, cost, sought = commands, new, True
             turn += 1
@@ -116,12 +119,15 @@ class Planner:
             commands,
         )[0]
 
-    def _from_statics(self, problem: Problem, least: float, rng: np.random.Generator) -> tuple[float, Floats]:
+    def _from_elsewhere(
+        self, problem: Problem, near: Floats | None, least: float, rng: np.random.Generator
+    ) -> tuple[float, Floats]:
         """Return cost and commands (H, N, 6) of a plan that is made of one command after another, then improved.
 
-        One whose first command costs more than ``least`` is given up.
+        It begins near the first of the commands ``near`` (H, N, 6), or from statics where they are None. One whose
+        first command costs more than ``least`` is given up.
         """
-        cost, first = self._held_on_the_way(problem, rng)
+        cost, first = self._led_up_to(problem, self._statics(problem, rng) if near is None else _beside(near[:1], rng))
         if self._stages == 1 or not cost < least:
             return cost if self._stages == 1 else math.inf, first
         goal, commands, state, before = problem.goal, [first[0]], problem.state.copy(), problem.before
@@ -135,13 +141,13 @@ class Planner:
                 goal._replace(references=goal.references[stage:], home=goal.home[stage:]),
                 before,
             )
-            found = [self._held_on_the_way(later, rng) for _ in range(LATER_SEARCHES)]
+            found = [self._led_up_to(later, self._statics(later, rng)) for _ in range(LATER_SEARCHES)]
             commands.append(min(found, key=lambda pair: pair[0])[1][0])
         whole = np.stack(commands)
         return self._polish(problem, whole), whole
 
-    def _held_on_the_way(self, problem: Problem, rng: np.random.Generator) -> tuple[float, Floats]:
-        """Return cost and command (1, N, 6) of a plan from poses that hold the robots on their way by statics."""
+    def _statics(self, problem: Problem, rng: np.random.Generator) -> Floats | None:
+        """Return a command (1, N, 6) that holds the robots on their way by statics, None where there is none."""
         ahead, body = problem.ahead(), self._plant.body
         halfway = problem.state[:COORDINATES] + 0.5 * ahead
         drag = np.array([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad] * 2)
@@ -152,10 +158,16 @@ class Planner:
         try:
             held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=IN_PLANE)
         except InputError:  # robots on the same spot, or a state that is not finite
+            return None
+        command: Floats = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
+        return command
+
+    def _led_up_to(self, problem: Problem, command: Floats | None) -> tuple[float, Floats]:
+        """Return cost and command (1, N, 6) of a plan from the given one, first for a part of its time."""
+        if command is None:
             return math.inf, problem.before[None]
-        command = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
-        allow(self._arms, problem.before, command[0])  # what holds may be out of the arms' reach
-        none, cost = np.zeros((STATE, STATE)), math.inf
+        allow(self._arms, problem.before, command[0])  # it may be out of the arms' reach
+        ahead, none, cost = problem.ahead(), np.zeros((STATE, STATE)), math.inf
         for motion in (*self._parts, self._motion):
             whole = motion is self._motion
             share = len(motion.which) / len(self._motion.which)
@@ -176,3 +188,10 @@ class Planner:
                 command,
             )
         return cost, command
+
+
+def _beside(commands: Floats, rng: np.random.Generator) -> Floats:
+    """Return commands (H, N, 6) a little beside the given ones."""
+    moved: Floats = commands + rng.normal(size=commands.shape) * np.repeat([BESIDE_M, BESIDE_RAD], 3)
+    moved[..., 3:] /= np.linalg.norm(moved[..., 3:], axis=-1, keepdims=True)
+    return moved

@@ -7,7 +7,7 @@ commands (``planner``) is made anew from the last one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ _DRIFT_N, _DRIFT_NM = 1e-4, 1e-6
 """By what a push drifts in a second, per mismatch of the parameters."""
 _AMISS_N, _AMISS_NM = 1e-3, 1e-5
 """Push at the beginning, per mismatch."""
+_JUMPS_DRIFT, _JUMPS_AMISS = 50.0, 10.0
+"""So many times as much where EPMs jump: with each jump, other things are amiss."""
 _START_MPS, _START_RADPS = 1e-3, 1e-3
 """Rates that an episode may begin with."""
 
@@ -107,15 +109,28 @@ class Predictive:
         Of whose kind the nominal plant is: how EPMs move, how exact measurements are.
     name : str
         Under which results are reported.
+    doubt : float
+        Share by which moments, masses and drags are reckoned to differ from the nominal ones, where the nominal
+        plant's mismatch is less. It costs the smallest separations, which only an exact model holds.
     """
 
     action: ActionMode = "pose"
     observation: ObservationMode = "full"
     frame: Frame = "robots"
 
-    def __init__(self, n_epm: int = 2, control_hz: float = 2.0, plant: str = "paper", name: str = "predictive") -> None:
+    def __init__(
+        self,
+        n_epm: int = 2,
+        control_hz: float = 2.0,
+        plant: str = "paper",
+        name: str = "predictive",
+        doubt: float = 0.0,
+    ) -> None:
+        require(0.0 <= doubt <= 0.9, "doubt", "from 0 to 0.9", doubt)
         self.name = name
-        self._system, self._plant = System(n_epm=n_epm), plant_named(plant)
+        nominal = plant_named(plant)
+        self._system = System(n_epm=n_epm)
+        self._plant = replace(nominal, mismatch=max(nominal.mismatch, doubt))
         self._period_s = period = TaskParams(control_hz=control_hz).period_s
         self._layout = Layout(self._system, self._plant.workspace_radius_m, period, self.observation, self.frame)
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
@@ -130,7 +145,7 @@ class Predictive:
         weights = _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)
         self._weights = np.concatenate([weights, SETTLING_S * weights])
         self._noise = _noise(self._plant)
-        amiss = self._plant.mismatch
+        amiss = self._plant.mismatch * (_JUMPS_AMISS if self._plant.epms_jump else 1.0)
         self._pushed = _per_coordinate(_PUSH_N + _AMISS_N * amiss, _PUSH_NM + _AMISS_NM * amiss) ** 2
         self._floor = np.concatenate(
             [_per_coordinate(0.3 * _FLOOR_M, _FLOOR_RAD), _per_coordinate(_FLOOR_MPS, _FLOOR_RADPS)]
@@ -250,8 +265,9 @@ def _root(covariance: Floats) -> Floats:
 def _noise(plant: Plant) -> Noise:
     """Return what the filter reckons with on a plant of this kind."""
     position, heading = math.hypot(plant.noise_position_m, _FLOOR_M), math.hypot(plant.noise_heading_rad, _FLOOR_RAD)
+    drift = plant.mismatch * (_JUMPS_DRIFT if plant.epms_jump else 1.0)
     return Noise(
         _per_coordinate(position, heading) ** 2,
-        _per_coordinate(_PUSH_N + _DRIFT_N * plant.mismatch, _PUSH_NM + _DRIFT_NM * plant.mismatch) ** 2,
+        _per_coordinate(_PUSH_N + _DRIFT_N * drift, _PUSH_NM + _DRIFT_NM * drift) ** 2,
         _per_coordinate(0.1 * _FLOOR_M, 0.1 * _FLOOR_RAD) ** 2,
     )

@@ -78,6 +78,21 @@ def test_it_holds_with_arms_that_lag_noise_and_magnets_that_are_amiss() -> None:
     assert not any(record.projected.any() for record in records), "no plan is nearer than the least gap"
 
 
+def test_doubt_holds_epms_that_are_no_dipoles() -> None:
+    """Three episodes of which one is lost by the controller that takes its dipoles at their word."""
+    certain, doubting = (
+        run(Predictive(doubt=doubt), "approach-60", "cylinders", episodes=3, seed=0) for doubt in (0.0, 0.05)
+    )
+    assert not all(record.success for record in certain)
+    assert all(record.success for record in doubting)
+
+
+def test_doubt_adds_nothing_where_the_nominal_plant_is_as_doubtful(make_env: MakeEnv) -> None:
+    env = make_env(scenario="approach-60", action="pose", plant="arm", control_hz=10.0)
+    (plain, _), (doubting, _) = (walk(env, Predictive(2, 10.0, "arm", doubt=doubt), 0, 3)[1:] for doubt in (0.0, 0.2))
+    np.testing.assert_array_equal(plain, doubting)
+
+
 @pytest.mark.parametrize(("n_epm", "control_hz"), [(3, 2.0), (2, 10.0), (3, 10.0), (2, 0.9)])
 def test_three_epms_and_other_control_rates(make_env: MakeEnv, n_epm: int, control_hz: float) -> None:
     """The error of the beginning is gone after a second, two holds at least, and stays away."""
@@ -264,10 +279,23 @@ def test_it_says_which_environment_it_speaks_to(make_env: MakeEnv) -> None:
     agent = Predictive()
     env = make_env(action=agent.action, observation=agent.observation, frame=agent.frame)
     assert env.action_space.contains(agent.predict(env.reset(seed=0)[0])[0])
-    assert isinstance(controller("predictive", 3, 10.0), Predictive)
+    for name in ("predictive", "predictive-robust"):
+        made = controller(name, 3, 10.0)
+        assert isinstance(made, Predictive)
+        assert made.name == name
 
 
-@pytest.mark.parametrize("changes", [{"n_epm": 0}, {"control_hz": 0.0}, {"control_hz": math.nan}, {"plant": "none"}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"n_epm": 0},
+        {"control_hz": 0.0},
+        {"control_hz": math.nan},
+        {"plant": "none"},
+        {"doubt": -0.1},
+        {"doubt": math.nan},
+    ],
+)
 def test_bad_input_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"Input {next(iter(changes))} must be"):
         Predictive(**changes)

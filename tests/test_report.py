@@ -171,7 +171,7 @@ def test_paths_are_drawn_to_scale_beside_their_references(records: list[Record])
 
 
 def test_a_controller_keeps_its_colour_in_any_company() -> None:
-    names = ["mine", "baseline", "yours", "tuned", "ppo", "sac", "predictive", "random", "idle"]
+    names = ["mine", "baseline", "yours", "tuned", "ppo", "sac", "predictive", "predictive-robust", "random", "idle"]
     colours = [figures.colour_of(name, names) for name in names]
     assert len(set(colours)) == len(names)
     assert figures.colour_of("ppo", names) == figures.colour_of("ppo", ["ppo", "other"])
