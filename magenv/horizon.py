@@ -28,6 +28,7 @@ from magenv.kernels import kernel
 from magenv.local import local_basis, seen_from, shift
 from magenv.manoeuvre import Arms, allow, move
 from magenv.poses import EPM_SIZE, POSE_SIZE
+from magenv.postures import away, crowd
 from magenv.risk import lean_on, risk
 from magenv.sensitivity import Model
 
@@ -36,10 +37,6 @@ Integers = NDArray[np.int64]
 
 _STEP_ANGLE, _STEP_RADIUS = 0.5, 0.05
 """Largest change of an angle (rad) and of a radius (m) in an iteration."""
-_PER_RADIUS = 10.0
-"""Weight of a metre of the centre's way in that of the way from home."""
-_ROOM_M = 0.03
-"""By so much more than the least gap should EPMs be apart."""
 _TRIALS = 10
 _SLOW = 1e-2
 """An iteration that takes off less than this share of the cost is the last."""
@@ -90,51 +87,6 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def _away(
-    command: Floats, home: Floats, bases: Floats, weight: float, residuals: Floats, jacobian: Floats, at: int
-) -> float:
-    """Write what a command's way from home, (N, 6) both, costs into the residuals from row ``at`` on; return it.
-
-    ``bases`` (N, 6, 5) are those of the command.
-    """
-    cost, n_epm = 0.0, len(command)
-    for k in range(n_epm):
-        for a in range(EPM_SIZE):
-            w, row = weight * (_PER_RADIUS if a < 3 else 1.0), at + EPM_SIZE * k + a
-            residuals[row] = w * (command[k, a] - home[k, a])
-            cost += residuals[row] * residuals[row]
-            for c in range(POSE_SIZE):
-                jacobian[row, POSE_SIZE * (n_epm + k) + STATE + c] = w * bases[k, a, c]
-    return cost
-
-
-@kernel
-def _crowd(
-    command: Floats, gap: float, bases: Floats, weight: float, residuals: Floats, jacobian: Floats, at: int
-) -> float:
-    """Write what EPMs (N, 6) that stand hardly farther apart than the least gap cost, from row ``at`` on; return it.
-
-    At the gap they could not go on: commands there are cut off. ``bases`` (N, 6, 5) are those of the command.
-    """
-    cost, n_epm, first = 0.0, len(command), jacobian.shape[1] - POSE_SIZE * len(command)
-    for k in range(n_epm):
-        for other in range(k):
-            p, q = command[k], command[other]
-            x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
-            distance = math.sqrt(dot3(x, y, z, x, y, z))
-            short, row = max(gap + _ROOM_M - distance, 0.0), at + k * (k - 1) // 2 + other
-            w = weight / 0.01 if short > 0.0 else 0.0
-            residuals[row] = w * short
-            cost += residuals[row] * residuals[row]
-            for c in range(3):
-                for which, away in ((k, -w / distance), (other, w / distance)):
-                    b = bases[which]
-                    column = first + POSE_SIZE * which + c
-                    jacobian[row, column] = away * (x * b[0, c] + y * b[1, c] + z * b[2, c])
-    return cost
-
-
-@kernel
 def _linearise(
     model: Model,
     pushing: Floats,
@@ -171,9 +123,9 @@ def _linearise(
                 seen = np.zeros((STATE, u))
                 cost += risk(model, pushing, motion, goal, stage, s.states[0], s.lean, scale, seen, residuals, jacobian)
         at += STATE
-        cost += _away(commands[stage], goal.home[stage], s.bases[stage + 1], goal.pull, residuals, jacobian, at)
+        cost += away(commands[stage], goal.home[stage], s.bases[stage + 1], goal.pull, residuals, jacobian, at)
         at += EPM_SIZE * len(before)
-        cost += _crowd(commands[stage], arms.limits.gap, s.bases[stage + 1], goal.room, residuals, jacobian, at)
+        cost += crowd(commands[stage], arms.limits.gap, s.bases[stage + 1], goal.room, residuals, jacobian, at)
     return cost, scale
 
 
@@ -250,19 +202,20 @@ def _forward(
 ) -> float:
     """Write commands changed by the gains, and the states they lead to; return their cost, infinite above ``least``."""
     n_epm, u = commands.shape[1], s.gains.shape[1]
-    away, step = np.zeros(STATE + u), np.empty(u)
+    deviation, step = np.zeros(STATE + u), np.empty(u)
     residuals, none, cost = np.empty(s.residuals.shape[1]), np.empty((STATE, 0)), 0.0
     s.trial_states[0] = s.states[0]
     for stage in range(len(commands)):
         trial, old = s.trial[stage], before if stage == 0 else s.trial[stage - 1]
-        away[u:] = s.trial_states[stage] - s.states[stage]
+        deviation[u:] = s.trial_states[stage] - s.states[stage]
         if stage > 0:
             for k in range(n_epm):
-                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], away[POSE_SIZE * k : POSE_SIZE * (k + 1)])
+                at = POSE_SIZE * k
+                seen_from(old[k], commands[stage - 1, k], s.bases[stage, k], deviation[at : at + POSE_SIZE])
         for i in range(u):
             total = s.gains[stage, i, STATE + u]
             for c in range(STATE + u):
-                total += s.gains[stage, i, c] * away[c]
+                total += s.gains[stage, i, c] * deviation[c]
             most = _STEP_RADIUS if i % POSE_SIZE == 2 else _STEP_ANGLE
             step[i] = min(max(total, -most), most)
         trial[:] = commands[stage]
@@ -279,10 +232,8 @@ def _forward(
             cost += risk(
                 model, pushing, motion, goal, stage, s.states[0], s.lean, scale, none, residuals, s.jacobians[0]
             )
-        for k in range(n_epm):
-            for a in range(EPM_SIZE):
-                cost += (goal.pull * (_PER_RADIUS if a < 3 else 1.0) * (trial[k, a] - goal.home[stage, k, a])) ** 2
-        cost += _crowd(trial, arms.limits.gap, s.bases[stage + 1], goal.room, residuals, s.scrap, 0)
+        cost += away(trial, goal.home[stage], s.bases[stage + 1], goal.pull, residuals, s.scrap, 0)
+        cost += crowd(trial, arms.limits.gap, s.bases[stage + 1], goal.room, residuals, s.scrap, 0)
         if not cost < least:
             return math.inf
     return cost

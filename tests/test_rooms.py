@@ -65,6 +65,7 @@ ORDER = [
     "forecast",
     "manoeuvre",
     "risk",
+    "postures",
     "horizon",
     "observer",
     "hold",
