@@ -3,8 +3,9 @@
 Three things stand between a controller and a lost episode, and each shows in the record of every hold:
 
 ``solver``    The command does not do what the controller asked for (``magenv.outcome``), though the EPMs are free.
-``bounds``    The EPMs stand at a limit (least or greatest radius, least gap), and the command does not do what was
-              asked for; of controllers without a solver nobody knows what they asked for: the limit alone counts.
+``bounds``    The EPMs stand at a limit (least or greatest radius, least gap, their arms' reach), and the command
+              does not do what was asked for; of controllers without a solver nobody knows what they asked for: the
+              limit alone counts.
 ``unstable``  Errors grow more than ``GROWTH``-fold until the next command, while the EPMs stand still at the end of
               the hold: a controller cannot measure what it would have to meet.
 
@@ -26,6 +27,7 @@ from agents.records import Record
 from magenv.outcome import FELL_BACK, NO_SOLVER, NOT_CONVERGED
 from magenv.params import System, TaskParams, plant_named
 from magenv.poses import POSE_SIZE, to_cartesian
+from magenv.reach import Shell, beyond_reach, narrowed
 from magenv.stiffness import growth_rates, planar_stiffness
 from magenv.wrench import planar_moments
 
@@ -87,12 +89,14 @@ def growth(record: Record, hold: int) -> float:
 
 
 def at_limit(record: Record, hold: int) -> bool:
-    """Return whether an EPM stands at a limit of its radius or two at their least gap, or were moved apart to it."""
+    """Return whether an EPM stands at a limit of its radius or reach or two at their least gap, or was moved there."""
     system, pose = System(n_epm=record.n_epm), record.epm_pose[hold + 1]
     radii = pose[2::POSE_SIZE]
-    centres, _ = to_cartesian(pose)
+    centres, directions = to_cartesian(pose)
+    reach = narrowed(Shell.of(system, plant_named(record.plant)), AT_LIMIT_M)
+    inside = beyond_reach(np.concatenate([centres, directions], axis=-1), reach, False) == 0.0
     gaps = [math.dist(centres[i], centres[j]) for i in range(len(centres)) for j in range(i)]
-    inside = system.r_min_m + AT_LIMIT_M < radii.min() and radii.max() < system.r_max_m - AT_LIMIT_M
+    inside &= system.r_min_m + AT_LIMIT_M < radii.min() and radii.max() < system.r_max_m - AT_LIMIT_M
     return bool(record.projected[hold]) or not inside or min(gaps) < system.gap_min_m + AT_LIMIT_M
 
 

@@ -139,7 +139,8 @@ def _line(axes: Axes, climb: Climb, colour: str, style: tuple[str, str], up_pt: 
 
 def tables(rungs: Sequence[Rung]) -> str:
     """Return Markdown tables, one per panel: success and position error on each rung, a column per line drawn."""
-    return "\n\n".join(_table(climbs) for climbs in by_panel(rungs))
+    panels = [_table(climbs) for climbs in by_panel(rungs)]
+    return "\n\n".join([*panels, _NOT_SURVIVED[0].upper() + _NOT_SURVIVED[1:] + "."])
 
 
 def _table(climbs: list[Climb]) -> str:

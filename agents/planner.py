@@ -2,7 +2,7 @@
 
 Elsewhere are poses that hold the robots on their way by statics and, in turn, poses a little beside the best plan;
 from them, plans are made for longer and longer parts of the command's time, in which errors grow less than in the
-whole of it.
+whole of it. EPMs that travel come only to what is near: there, all of the best plan is moved a little.
 """
 
 from __future__ import annotations
@@ -29,9 +29,12 @@ ENOUGH = 1.0
 """Cost per command below which a plan is taken without seeking others."""
 TROUBLE = 20.0
 """Cost per command above which more are sought."""
-SEARCHES, MORE_SEARCHES = 2, 16
-BESIDE_M, BESIDE_RAD = 0.01, 0.05
-"""How far beside the best plan every second search begins: standard deviations of EPMs' positions and directions."""
+SEARCHES, MORE_SEARCHES, TRAVEL_SEARCHES = 2, 16, 6
+"""How many of them at most: below that cost, above it, and above it where EPMs travel."""
+BESIDE = np.repeat([0.01, 0.05], 3)
+"""How far beside the best plan every second search begins: standard deviations of an EPM's position (m) and moment."""
+TRAVEL_BESIDE = np.repeat([0.03, 0.3], 3)
+"""The same where EPMs travel, of every search."""
 LATER_SEARCHES = 3
 """Starts of the later commands of a plan."""
 ITERATIONS, SHORT_ITERATIONS = 15, 8
@@ -85,7 +88,7 @@ class Planner:
         cost = self._polish(problem, best)
         turn = 0
         while not cost < ENOUGH * self._stages and turn < self._searches(cost):
-            new, commands = self._from_elsewhere(problem, best if turn % 2 else None, cost, rng)
+            new, commands = self._from_elsewhere(problem, best, turn, cost, rng)
             if new < cost:
                 best, cost, sought = commands, new, True
             turn += 1
@@ -93,9 +96,17 @@ class Planner:
 
     def _searches(self, cost: float) -> int:
         """Return how often another plan is sought at most, while the best one has this cost."""
-        if self._arms.travels:  # EPMs come only where the last plan, too, can be bent to
-            return 0
-        return SEARCHES if cost < TROUBLE * self._stages else MORE_SEARCHES
+        if cost < TROUBLE * self._stages:
+            return 0 if self._arms.travels else SEARCHES
+        return TRAVEL_SEARCHES if self._arms.travels else MORE_SEARCHES
+
+    def missed(self, problem: Problem, commands: Floats) -> float:
+        """Return the cost of the errors alone that commands (H, N, 6) lead to."""
+        cost, state, before, goal = 0.0, problem.state.copy(), problem.before, problem.goal
+        for stage, command in enumerate(commands):
+            cost += land(self.model, state, problem.pushing, goal, self._arms, self._motion, stage, before, command)
+            before = command
+        return cost
 
     def path(self, before: Floats, command: Floats) -> Floats:
         """Return where the EPMs are in each substep (M, N, 6) of a command's time, the ones before standing there."""
@@ -120,14 +131,26 @@ class Planner:
         )[0]
 
     def _from_elsewhere(
-        self, problem: Problem, near: Floats | None, least: float, rng: np.random.Generator
+        self, problem: Problem, best: Floats, turn: int, least: float, rng: np.random.Generator
+    ) -> tuple[float, Floats]:
+        """Return cost and commands (H, N, 6) of search ``turn``; ``best`` (H, N, 6) is the best found so far."""
+        if self._arms.travels:
+            commands, before = _beside(best, TRAVEL_BESIDE, rng), problem.before
+            for command in commands:
+                allow(self._arms, before, command)
+                before = command
+            return self._polish(problem, commands), commands
+        first = self._statics(problem, rng) if turn % 2 == 0 else _beside(best[:1], BESIDE, rng)
+        return self._one_after_another(problem, first, least, rng)
+
+    def _one_after_another(
+        self, problem: Problem, first: Floats | None, least: float, rng: np.random.Generator
     ) -> tuple[float, Floats]:
         """Return cost and commands (H, N, 6) of a plan that is made of one command after another, then improved.
 
-        It begins near the first of the commands ``near`` (H, N, 6), or from statics where they are None. One whose
-        first command costs more than ``least`` is given up.
+        It begins with ``first`` (1, N, 6). One whose first command costs more than ``least`` is given up.
         """
-        cost, first = self._led_up_to(problem, self._statics(problem, rng) if near is None else _beside(near[:1], rng))
+        cost, first = self._led_up_to(problem, first)
         if self._stages == 1 or not cost < least:
             return cost if self._stages == 1 else math.inf, first
         goal, commands, state, before = problem.goal, [first[0]], problem.state.copy(), problem.before
@@ -190,8 +213,8 @@ class Planner:
         return cost, command
 
 
-def _beside(commands: Floats, rng: np.random.Generator) -> Floats:
-    """Return commands (H, N, 6) a little beside the given ones."""
-    moved: Floats = commands + rng.normal(size=commands.shape) * np.repeat([BESIDE_M, BESIDE_RAD], 3)
+def _beside(commands: Floats, deviation: Floats, rng: np.random.Generator) -> Floats:
+    """Return commands (H, N, 6) a little beside the given ones, by standard deviations (6,)."""
+    moved: Floats = commands + rng.normal(size=commands.shape) * deviation
     moved[..., 3:] /= np.linalg.norm(moved[..., 3:], axis=-1, keepdims=True)
     return moved

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import RowGenerators
-from agents.planner import ENOUGH, Planner, Problem
+from agents.planner import ENOUGH, TROUBLE, Planner, Problem
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
 from magenv.home import start_rows
@@ -56,9 +56,12 @@ _STAY = 3.0
 _ROOM = 3.0
 """Weight of EPMs that are too near to each other, there."""
 
+_ASTRAY = 1e-3
+"""From which difference on, in metres and of unit vectors, EPMs that travel are not where they were believed to be."""
+
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
-"""How a command was come by: from the last plan; from a search; the best of a search without convergence; none found,
-the last safe command held."""
+"""How a command was come by: from the last plan; from a search; from a search without convergence, or where EPMs travel
+one that leaves great errors; none found, the last safe command held."""
 _OUTCOMES = np.array([SOLVED, SOLVED, NOT_CONVERGED, FELL_BACK])
 
 
@@ -126,7 +129,7 @@ class Predictive:
         name: str = "predictive",
         doubt: float = 0.0,
     ) -> None:
-        require(0.0 <= doubt <= 0.9, "doubt", "from 0 to 0.9", doubt)
+        require(isinstance(doubt, int | float) and 0.0 <= doubt <= 0.9, "doubt", "a number from 0 to 0.9", doubt)
         self.name = name
         nominal = plant_named(plant)
         self._system = System(n_epm=n_epm)
@@ -165,6 +168,7 @@ class Predictive:
     ) -> tuple[NDArray[np.float32], PredictiveState]:
         """Return the ``pose`` actions (n, 5 N) for observations (n, d), or (5 N,) for (d,), and the new state."""
         batch = np.atleast_2d(observation)
+        batch = np.where(np.isfinite(batch), batch, np.float32(np.nan))  # infinite numbers tell no more
         parts = unpack(batch, self._layout)
         n = len(batch)
         if state is None:
@@ -190,6 +194,8 @@ class Predictive:
 
     def _begin(self, measured: Floats, epms: Floats) -> Memory:
         """Return the memory of an episode that begins, at rest."""
+        if not np.isfinite(epms).all():
+            epms = self._home
         known = np.zeros(MOMENTS + len(epms) + 2)
         known[:COORDINATES] = measured
         unknown = _per_coordinate(_START_MPS, _START_RADPS) ** 2
@@ -200,15 +206,32 @@ class Predictive:
 
     def _update(self, memory: Memory, measured: Floats, epms: Floats) -> None:
         """Carry the estimate over the last hold and correct it; one that was lost is begun anew."""
-        if self._lag == 0 and self._plant.epms_jump:
-            memory.paths[self._substeps :] = epms  # what was commanded, as it was carried out
         first = self._substeps - self._lag  # commands act late
+        self._see(memory, epms)
         self._follow(memory.paths[first : first + self._substeps], memory.known, memory.covariance)
         if not np.abs(memory.covariance[:COORDINATES]).max() < _LOST:  # NaN as well
             fresh = self._begin(measured, epms)
             memory.known, memory.covariance = fresh.known, fresh.covariance
             return
         correct(measured, self._noise, memory.known, memory.covariance)
+
+    def _see(self, memory: Memory, epms: Floats) -> None:
+        """Mend what is believed of the EPMs' motion by where they are seen (N, 6), at the end of the last hold."""
+        now = 2 * self._substeps - self._lag
+        if not np.isfinite(epms).all():
+            return
+        if self._plant.epms_jump:
+            if self._lag == 0:
+                memory.paths[self._substeps :] = epms  # what was commanded, as it was carried out
+            return
+        astray = epms - memory.paths[now - 1]
+        if np.abs(astray).max() < _ASTRAY:
+            return
+        # They are not as fast as believed: what lacks now came evenly, and will lack.
+        share = np.minimum(np.arange(1, len(memory.paths) - now + self._substeps + 1) / self._substeps, 1.0)
+        memory.paths[now - self._substeps :] += share[:, None, None] * astray
+        memory.paths[..., 3:] /= np.linalg.norm(memory.paths[..., 3:], axis=-1, keepdims=True)
+        memory.before = memory.paths[-1].copy()
 
     def _follow(self, path: Floats, known: Floats, covariance: Floats) -> None:
         """Carry an estimate over the substeps of a path (K, N, 6) of the EPMs."""
@@ -225,8 +248,9 @@ class Predictive:
         rates = np.concatenate([1.5 * turn[:1] - 0.5 * turn[1:2], 0.5 * (turn[:-1] + turn[1:])]) / self._period_s
         states = np.concatenate([references[:4], rates], axis=-1)
         share = self._lag / self._substeps  # commands act late, and so do their times end
-        states[:-1, :COORDINATES] += share * turn[:3]
-        states[:-1, COORDINATES:] += share * np.diff(states[:, COORDINATES:], axis=0)
+        growth = np.diff(states[:, COORDINATES:], axis=0)
+        states[:, :COORDINATES] += share * turn
+        states[:, COORDINATES:] += share * np.concatenate([growth, growth[-1:]])
         states = states[: self._stages]
         home, pull, room = np.repeat(before[None], len(states), axis=0), 0.0, 0.0
         if not self._plant.epms_jump:
@@ -243,7 +267,7 @@ class Predictive:
             self._follow(memory.paths[-self._lag :], known, covariance)
             if not np.isfinite(covariance).all():
                 known, covariance = memory.known.copy(), memory.covariance.copy()
-        elif self._plant.epms_jump:
+        elif self._plant.epms_jump and np.isfinite(epms).all():
             before = epms
         believe(self._planner.model, known[MOMENTS:])
         doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
@@ -252,6 +276,8 @@ class Predictive:
         if not math.isfinite(cost):
             memory.commands = np.repeat(before[None], self._stages, axis=0)
             return FALLBACK
+        if not self._plant.epms_jump:  # there, noise and ways cost as well
+            return UNSOLVED if self._planner.missed(problem, memory.commands) > TROUBLE * self._stages else CONVERGED
         return UNSOLVED if cost > ENOUGH * self._stages else SOUGHT if sought else CONVERGED
 
 

@@ -102,7 +102,7 @@ def print_scores(found: Sequence[Score], sweep: Sweep, console: Console | None =
             f"from seed {sweep.seed} per value"
         )
         table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0)
-        table.add_column("controller", max_width=16, overflow="fold")
+        table.add_column("controller", max_width=17, overflow="fold")
         for name in (BASE, *(criterion.name for criterion in CRITERIA), "overall"):
             table.add_column(name, justify="right", no_wrap=True)
         for score in found:

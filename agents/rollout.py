@@ -85,10 +85,12 @@ def run(
 
 
 def _warm_up(env: gymnasium.Env[Any, Any], controller: Controller, seed: int) -> None:
-    """Let the controller predict once, so that compiling and loading are not counted as its time."""
+    """Let the controller predict twice, so that compiling and loading are not counted as its time."""
     observation, _ = env.reset(seed=seed)
     controller.seed(controller_seed(seed))
-    controller.predict(observation[None], None, np.ones(1, np.bool_), deterministic=True)
+    state = None
+    for start in (True, False):
+        _, state = controller.predict(observation[None], state, np.array([start]), deterministic=True)
 
 
 def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: Settings, seed: int) -> Record:

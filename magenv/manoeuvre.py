@@ -147,13 +147,19 @@ def move(arms: Arms, before: Floats, command: Floats, bases: Floats, motion: Cou
 
 
 @kernel
-def _within(start: Floats, goal: Floats, first: int, most: float) -> float:
-    """Return the share of the way from start to goal (3,) of a centre (``first`` 0) or moment (3) that is ``most``."""
+def _length(start: Floats, goal: Floats, first: int) -> float:
+    """Return the way from start to goal (3,) of a centre (``first`` 0), m, or of a moment (3), rad."""
     near, u = _unit(start)
     far, v = _unit(goal)
     angle, _ = way_round(u, v)
     arc, out = (max(near, far) * angle, far - near) if first == 0 else (angle, 0.0)
-    way = math.sqrt(arc * arc + out * out)
+    return math.sqrt(arc * arc + out * out)
+
+
+@kernel
+def _within(start: Floats, goal: Floats, first: int, most: float) -> float:
+    """Return the share of the way from start to goal (3,) of a centre (``first`` 0) or moment (3) that is ``most``."""
+    way = _length(start, goal, first)
     return 1.0 if way <= most else _LESS * most / way
 
 
@@ -209,10 +215,33 @@ def _bend(limits: Motion, k: int, before: Floats, goal: Floats, most: float) -> 
 
 
 @kernel
+def _keeps_apart(arms: Arms, before: Floats, command: Floats, least: float) -> bool:
+    """Return whether no two centres come closer than ``least`` (m), all the way from the poses before, (N, 6) each."""
+    n, limits, longest = len(command), arms.limits, 0.0
+    lengths, place = np.empty(n), np.zeros((1, n, EPM_SIZE))
+    for k in range(n):
+        lengths[k] = _length(before[k, :3], command[k, :3], 0)
+        longest = max(longest, lengths[k])
+        place[0, k] = command[k]
+    if not keeps_gap(place, 0, least):
+        return False
+    if keeps_gap(place, 0, least + 2.0 * longest):  # too far from each other to come close
+        return True
+    for j in range(arms.substeps):
+        for k in range(n):
+            up, flat = ramp(lengths[k] / limits.reach, limits.rise)
+            _go_share(before[k, :3], command[k, :3], _share(j, up, flat), place[0, k, :3])
+        if not keeps_gap(place, 0, least):
+            return False
+    return True
+
+
+@kernel
 def allow(arms: Arms, before: Floats, command: Floats) -> None:
     """Make a command (N, 6) one that keeps radii, gap and reach, and where the EPMs travel, is reached in its time.
 
-    Centres that are too close where their time is over go less far, all by the same share: before, they were not.
+    Centres that would come too close, on the way or at its end, go less far, all by the same share: before, they were
+    not.
     """
     limits = arms.limits
     project_reach(command, limits.r_min, limits.r_max, limits.gap, narrowed(limits.shell, COMMAND_MARGIN_M))
@@ -228,14 +257,14 @@ def allow(arms: Arms, before: Floats, command: Floats) -> None:
         _go_share(
             before[k, 3:], goal[k, 3:], _within(before[k, 3:], goal[k, 3:], 3, limits.turn * turn), command[k, 3:]
         )
-    row, least = command.reshape(1, len(command), EPM_SIZE), limits.gap - GAP_TOLERANCE_M
-    if keeps_gap(row, 0, least):
+    least = limits.gap - GAP_TOLERANCE_M
+    if _keeps_apart(arms, before, command, least):
         return
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         for k in range(len(command)):
             _go_share(before[k, :3], goal[k, :3], middle * shares[k], command[k, :3])
-        low, high = (middle, high) if keeps_gap(row, 0, least) else (low, middle)
+        low, high = (middle, high) if _keeps_apart(arms, before, command, least) else (low, middle)
     for k in range(len(command)):
         _go_share(before[k, :3], goal[k, :3], low * shares[k], command[k, :3])

@@ -58,8 +58,11 @@ class Shell(NamedTuple):
         inner, outer = plant.arm_reach_min_m, plant.arm_reach_m
         away = math.hypot(plant.arm_distance_m, plant.arm_height_m)
         low, high = max(math.hypot(system.r_max_m, inner), system.r_min_m + inner + _SPARE_M), outer - system.r_min_m
-        must_be = f"such that shoulders {plant.arm_height_m:g} m high are {low:.4g} to {high - _SPARE_M:.4g} m away"
-        require(outer == math.inf or low <= away <= high - _SPARE_M, "arm_distance_m", must_be, plant.arm_distance_m)
+        high -= _SPARE_M
+        require(high >= low, "arm_reach_m", f"at least {outer + low - high:.4g}, for arms to reach all round", outer)
+        must_be = f"such that shoulders {plant.arm_height_m:g} m high are {low:.4g} to {high:.4g} m from the centre"
+        must_be += f" (now {away:.4g} m)"
+        require(outer == math.inf or low <= away <= high, "arm_distance_m", must_be, plant.arm_distance_m)
         return cls(inner, outer, plant.arm_distance_m, plant.arm_height_m)
 
 

@@ -11,12 +11,13 @@ from recorded import a_record
 
 from agents import causes
 from agents.catalogue import controller
-from agents.causes import FirstLost, growth, hold_of_leaving, lost_first
+from agents.causes import FirstLost, at_limit, growth, hold_of_leaving, lost_first
 from agents.records import Record
 from agents.rollout import run
 from magenv.outcome import CONVERGED, FELL_BACK, NO_SOLVER, NOT_CONVERGED, OUTCOMES, outcome_of
 from magenv.params import PLANTS, System, TaskParams
-from magenv.poses import home_pose, to_cartesian
+from magenv.poses import from_cartesian, home_pose, to_cartesian
+from magenv.reach import Shell, shoulder
 from magenv.stiffness import planar_stiffness
 from magenv.trajectories import approach
 from magenv.world import World
@@ -104,6 +105,16 @@ def test_what_appears_after_the_robots_have_left_is_told_where_nothing_was_there
     assert lost_first(record) == FirstLost("unstable", 8.0)
     unstable.add(11)
     assert lost_first(record) == FirstLost("unstable", 5.5)
+
+
+def test_an_arm_that_reaches_no_farther_is_at_its_limit() -> None:
+    record, shell = lost(plant="arm-reach"), Shell.of(System(), PLANTS["arm-reach"])
+    base = np.array(shoulder(shell, 0, 2))
+    for spare, limited in ((2e-5, True), (1e-3, False)):
+        stretched = base * (1.0 - (shell.outer - spare) / np.linalg.norm(base))
+        centres = np.array([stretched, [0.25, -0.1, 0.1]])
+        record.epm_pose[4] = from_cartesian(centres, np.array([[1.0, 0.0, 0.0]] * 2))
+        assert at_limit(record, 3) == limited
 
 
 def test_an_episode_that_is_held_has_lost_nothing() -> None:

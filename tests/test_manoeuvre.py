@@ -78,6 +78,10 @@ def test_what_is_allowed_keeps_radii_and_gap_and_is_allowed_again(
         radii, pairs = np.linalg.norm(command[:, :3], axis=1), itertools.combinations(command[:, :3], 2)
         assert system.r_min_m - 1e-9 <= radii.min() <= radii.max() <= system.r_max_m + 1e-9
         assert min(np.linalg.norm(one - other) for one, other in pairs) >= system.gap_min_m - 1e-9
+        if arms.travels:  # and on the way
+            path = moved(arms, before, command, 40).path[..., :3]
+            pairs = itertools.combinations(path.swapaxes(0, 1), 2)
+            assert min(np.linalg.norm(one - other, axis=1).min() for one, other in pairs) >= system.gap_min_m - 1e-4
         np.testing.assert_allclose(np.linalg.norm(command[:, 3:], axis=1), 1.0, rtol=1e-12)
         allow(arms, before, command)
         np.testing.assert_allclose(command, once, atol=1e-9)

@@ -53,7 +53,10 @@ def test_commands_made_one_after_another_are_good_before_they_are_improved(monke
     """Each reckons with where the one before lands, and aims at a reference of its own."""
     planner, problem = a_planner(3, 3), a_problem(3, 3)
     monkeypatch.setattr(planner, "_polish", lambda problem, commands: cost_of(planner, problem, commands))
-    costs = [planner._from_elsewhere(problem, None, math.inf, np.random.default_rng(seed))[0] for seed in range(5)]
+    costs = [
+        planner._from_elsewhere(problem, problem.before[None], 0, math.inf, np.random.default_rng(seed))[0]
+        for seed in range(5)
+    ]
     assert min(costs) < 0.1
     assert np.median(costs) < ENOUGH
 

@@ -19,6 +19,7 @@ from agents.predictive import CONVERGED, FALLBACK, SOUGHT, UNSOLVED, Predictive,
 from agents.rollout import run
 from magenv.actions import pose_to_action
 from magenv.env import TwoRobots
+from magenv.outcome import CONVERGED as SOLVED
 from magenv.outcome import FELL_BACK
 from magenv.params import PLANTS, Body, Plant, System
 from magenv.poses import from_cartesian
@@ -71,11 +72,25 @@ def test_it_holds_five_episodes_of_which_the_tuned_controller_holds_none() -> No
 
 
 def test_it_holds_with_arms_that_lag_noise_and_magnets_that_are_amiss() -> None:
-    """At 10 Hz on ``arm``; without moments learned and a home the EPMs are drawn to, most episodes are lost."""
+    """At 10 Hz on ``arm``; without moments learned errors are several times as great."""
     records = run(Predictive(2, 10.0, "arm"), "approach-60", "arm", control_hz=10.0, episodes=2, seed=0)
     assert [record.success for record in records] == [True] * 2
-    assert 1e3 * np.mean([record.position_error_m.mean() for record in records]) < 2.0
+    assert 1e3 * np.mean([record.position_error_m.mean() for record in records]) < 1.0
+    for record in records:
+        assert (record.solver == SOLVED).mean() > 0.8, "plans mostly meet the reference"
     assert not any(record.projected.any() for record in records), "no plan is nearer than the least gap"
+
+
+def test_a_first_plan_that_goes_wrong_is_sought_again_where_epms_travel() -> None:
+    """Three EPMs that go from home: the first descent ends where robots are flung away."""
+    (record,) = run(Predictive(3, 2.0, "moving"), "approach-60", "moving", n_epm=3, episodes=1, seed=0)
+    assert record.success
+
+
+def test_epms_that_are_slower_than_believed_are_seen() -> None:
+    slow = "moving:epm_speed_mps=0.5,epm_turn_radps=1.57"
+    (record,) = run(Predictive(2, 2.0, "moving"), "approach-60", slow, episodes=1, seed=0)
+    assert record.success
 
 
 def test_doubt_holds_epms_that_are_no_dipoles() -> None:
@@ -238,6 +253,25 @@ def test_what_could_not_be_foreseen_once_is_over_with_the_next_observation(make_
     action, state = agent.predict(observation, state, GOES_ON)
     assert state.status[0] in (CONVERGED, SOUGHT)
     assert np.isfinite(action).all()
+
+
+@pytest.mark.parametrize("plant", ["paper", "arm"])
+@pytest.mark.parametrize("nothing", [math.nan, math.inf, -math.inf])
+def test_what_tells_nothing_moves_nothing_unforeseen(make_env: MakeEnv, plant: str, nothing: float) -> None:
+    """At first an action, later the last command; with the next observation it is over."""
+    observation, agent = (
+        first(make_env(scenario="approach-60", plant=plant, control_hz=10.0), 0),
+        Predictive(2, 10.0, plant),
+    )
+    blind = np.full_like(observation, nothing)
+    assert np.isfinite(agent.predict(blind)[0]).all()
+    last, state = agent.predict(observation)
+    action, state = agent.predict(blind, state, GOES_ON)
+    assert state.status[0] == FALLBACK
+    np.testing.assert_allclose(action, last, atol=1e-6)
+    action, state = agent.predict(observation, state, GOES_ON)
+    assert np.isfinite(action).all()
+    assert state.status[0] != FALLBACK
 
 
 @pytest.mark.parametrize("seed", [11, 15])

@@ -118,6 +118,7 @@ def test_each_arm_reaches_much_and_not_all(rng: np.random.Generator, n_epm: int)
         ("arm:arm_reach_m=0", "arm_reach_m", "a number above 0"),
         ("arm:arm_reach_m=nan", "arm_reach_m", "a number above 0"),
         ("arm:arm_reach_m=0.4", "arm_reach_min_m", "a number of at least 0 and below arm_reach_m = 0.4"),
+        ("arm:arm_reach_m=0.75", "arm_reach_m", "at least 0.7976, for arms to reach all round"),
         ("arm-reach:arm_reach_min_m=-0.1", "arm_reach_min_m", "a number of at least 0 and below arm_reach_m = 0.82"),
         ("arm-reach:arm_distance_m=-1", "arm_distance_m", "a positive, finite number"),
         ("arm-reach:arm_height_m=inf", "arm_height_m", "a finite number"),
