@@ -66,7 +66,7 @@ class Controller(Protocol):
         observation : ndarray, shape (n, d) or (d,)
             One per episode, or a single one.
         state : optional
-            What the previous call returned; None at the start.
+            What the previous call returned; None at the start. It may be changed in place: it serves once.
         episode_start : ndarray of bool, shape (n,), optional
             Where an episode begins: the state of these rows is to be forgotten.
         deterministic : bool

@@ -109,7 +109,7 @@ class Predictive:
     control_hz : float
         Control rate.
     plant : str
-        Of whose kind the nominal plant is: how EPMs move, how exact measurements are.
+        Of whose kind the nominal plant is: how EPMs move, how exact measurements are, nominal masses and drags.
     name : str
         Under which results are reported.
     doubt : float
