@@ -13,15 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.actions import planar_target
-from magenv.allocation import allocate
+from agents.statics import Statics
+from agents.trim import beside
 from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms, allow, move
-from magenv.params import InputError, Plant, System
-from magenv.poses import EPM_SIZE, POSE_SIZE, to_cartesian
+from magenv.params import Plant, System
+from magenv.poses import EPM_SIZE, POSE_SIZE
 from magenv.sensitivity import COORDINATES, Model
-from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
 
@@ -69,10 +68,11 @@ class Planner:
     """Plans of ``stages`` commands of ``substeps`` each on a nominal plant."""
 
     def __init__(self, system: System, plant: Plant, period_s: float, substeps: int, stages: int) -> None:
-        self._system, self._plant, self._period_s, self._stages = system, plant, period_s, stages
+        self._period_s, self._stages = period_s, stages
+        self.statics = Statics(system, plant)
         self.model = Model.of(system, plant, period_s / substeps)
         n, travels = system.n_epm, not plant.epms_jump
-        self._arms = Arms.of(system, plant, self.model.substep, substeps)
+        self.arms = Arms.of(system, plant, self.model.substep, substeps)
         self._motion = Course.of(n, substeps, travels)
         self._parts = [Course.of(n, max(1, round(share * substeps)), travels) for share in PARTS]
         self._scratch, self._single = Scratch.of(stages, n, 1), Scratch.of(1, n, 1)
@@ -97,20 +97,20 @@ class Planner:
     def _searches(self, cost: float) -> int:
         """Return how often another plan is sought at most, while the best one has this cost."""
         if cost < TROUBLE * self._stages:
-            return 0 if self._arms.travels else SEARCHES
-        return TRAVEL_SEARCHES if self._arms.travels else MORE_SEARCHES
+            return 0 if self.arms.travels else SEARCHES
+        return TRAVEL_SEARCHES if self.arms.travels else MORE_SEARCHES
 
     def missed(self, problem: Problem, commands: Floats) -> float:
         """Return the cost of the errors alone that commands (H, N, 6) lead to."""
         cost, state, before, goal = 0.0, problem.state.copy(), problem.before, problem.goal
         for stage, command in enumerate(commands):
-            cost += land(self.model, state, problem.pushing, goal, self._arms, self._motion, stage, before, command)
+            cost += land(self.model, state, problem.pushing, goal, self.arms, self._motion, stage, before, command)
             before = command
         return cost
 
     def path(self, before: Floats, command: Floats) -> Floats:
         """Return where the EPMs are in each substep (M, N, 6) of a command's time, the ones before standing there."""
-        move(self._arms, before, command, np.empty((0, len(command), EPM_SIZE, POSE_SIZE)), self._motion)
+        move(self.arms, before, command, np.empty((0, len(command), EPM_SIZE, POSE_SIZE)), self._motion)
         return self._motion.path[self._motion.which]
 
     def _polish(self, problem: Problem, commands: Floats) -> float:
@@ -121,7 +121,7 @@ class Planner:
             problem.pushing,
             problem.doubt,
             problem.goal,
-            self._arms,
+            self.arms,
             self._motion,
             problem.before,
             CONVERGED,
@@ -134,13 +134,13 @@ class Planner:
         self, problem: Problem, best: Floats, turn: int, least: float, rng: np.random.Generator
     ) -> tuple[float, Floats]:
         """Return cost and commands (H, N, 6) of search ``turn``; ``best`` (H, N, 6) is the best found so far."""
-        if self._arms.travels:
-            commands, before = _beside(best, TRAVEL_BESIDE, rng), problem.before
+        if self.arms.travels:
+            commands, before = beside(best, TRAVEL_BESIDE, rng), problem.before
             for command in commands:
-                allow(self._arms, before, command)
+                allow(self.arms, before, command)
                 before = command
             return self._polish(problem, commands), commands
-        first = self._statics(problem, rng) if turn % 2 == 0 else _beside(best[:1], BESIDE, rng)
+        first = self._held(problem, rng) if turn % 2 == 0 else beside(best[:1], BESIDE, rng)
         return self._one_after_another(problem, first, least, rng)
 
     def _one_after_another(
@@ -155,7 +155,7 @@ class Planner:
             return cost if self._stages == 1 else math.inf, first
         goal, commands, state, before = problem.goal, [first[0]], problem.state.copy(), problem.before
         for stage in range(1, self._stages):
-            land(self.model, state, problem.pushing, goal, self._arms, self._motion, stage - 1, before, commands[-1])
+            land(self.model, state, problem.pushing, goal, self.arms, self._motion, stage - 1, before, commands[-1])
             before = commands[-1]
             later = Problem(
                 state,
@@ -164,32 +164,23 @@ class Planner:
                 goal._replace(references=goal.references[stage:], home=goal.home[stage:]),
                 before,
             )
-            found = [self._led_up_to(later, self._statics(later, rng)) for _ in range(LATER_SEARCHES)]
+            found = [self._led_up_to(later, self._held(later, rng)) for _ in range(LATER_SEARCHES)]
             commands.append(min(found, key=lambda pair: pair[0])[1][0])
         whole = np.stack(commands)
         return self._polish(problem, whole), whole
 
-    def _statics(self, problem: Problem, rng: np.random.Generator) -> Floats | None:
+    def _held(self, problem: Problem, rng: np.random.Generator) -> Floats | None:
         """Return a command (1, N, 6) that holds the robots on their way by statics, None where there is none."""
-        ahead, body = problem.ahead(), self._plant.body
+        ahead = problem.ahead()
         halfway = problem.state[:COORDINATES] + 0.5 * ahead
-        drag = np.array([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad] * 2)
-        target, positions = np.empty(WRENCH_SIZE), np.zeros((2, 3))
-        planar_target(drag * ahead / self._period_s - problem.pushing, halfway[2], halfway[5], target)
-        positions[:, :2] = halfway.reshape(2, 3)[:, :2]
-        moments = planar_moments(halfway[2::3], self._system.ipm_moment_am2)
-        try:
-            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=IN_PLANE)
-        except InputError:  # robots on the same spot, or a state that is not finite
-            return None
-        command: Floats = np.concatenate(to_cartesian(held.pose), axis=-1)[None]
-        return command
+        held = self.statics.hold(halfway, ahead / self._period_s, problem.pushing, rng)
+        return None if held is None else held[None]
 
     def _led_up_to(self, problem: Problem, command: Floats | None) -> tuple[float, Floats]:
         """Return cost and command (1, N, 6) of a plan from the given one, first for a part of its time."""
         if command is None:
             return math.inf, problem.before[None]
-        allow(self._arms, problem.before, command[0])  # it may be out of the arms' reach
+        allow(self.arms, problem.before, command[0])  # it may be out of the arms' reach
         ahead, none, cost = problem.ahead(), np.zeros((STATE, STATE)), math.inf
         for motion in (*self._parts, self._motion):
             whole = motion is self._motion
@@ -202,7 +193,7 @@ class Planner:
                 problem.pushing,
                 problem.doubt if whole else none,
                 problem.goal if whole else part,
-                self._arms,
+                self.arms,
                 motion,
                 problem.before,
                 CONVERGED,
@@ -211,10 +202,3 @@ class Planner:
                 command,
             )
         return cost, command
-
-
-def _beside(commands: Floats, deviation: Floats, rng: np.random.Generator) -> Floats:
-    """Return commands (H, N, 6) a little beside the given ones, by standard deviations (6,)."""
-    moved: Floats = commands + rng.normal(size=commands.shape) * deviation
-    moved[..., 3:] /= np.linalg.norm(moved[..., 3:], axis=-1, keepdims=True)
-    return moved

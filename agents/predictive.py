@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from agents.controller import RowGenerators
 from agents.planner import ENOUGH, TROUBLE, Planner, Problem
+from agents.trim import ROOM, Trim
 from magenv.actions import ActionMode, pose_to_action
 from magenv.forecast import STATE, Course, Goal
-from magenv.home import start_rows
+from magenv.home import home_epms
 from magenv.observer import MOMENTS, Noise, correct, forecast
 from magenv.outcome import CONVERGED as SOLVED
 from magenv.outcome import FELL_BACK, NOT_CONVERGED
 from magenv.params import Plant, System, TaskParams, plant_named, require
-from magenv.poses import POSE_SIZE, from_cartesian, ring
+from magenv.poses import POSE_SIZE, from_cartesian
 from magenv.sensitivity import COORDINATES, believe
 from magenv.task import Frame, Layout, ObservationMode, unpack
 
@@ -46,16 +47,11 @@ _START_MPS, _START_RADPS = 1e-3, 1e-3
 
 _LOST = 1.0
 """Variance (m^2, rad^2, and with others) from which on a pose is not known at all."""
-_HOME_RADIUS_M, _HOME_TILT_RAD = 0.16, math.radians(62.0)
-"""Where EPMs that travel are drawn to, in the robots' frame: broadside, near, and steep. By Earnshaw's theorem no hold
-is stable in all directions; from above and below the unstable one is nearly the vertical, which the plane bears."""
 _PULL = 0.6
-"""Weight of the way from there: EPMs do not come back by themselves from where they can do little."""
+"""Weight of the way from the trim where EPMs travel: EPMs do not come back by themselves from where they can do
+little."""
 _STAY = 3.0
 """Weight of the way from the last command, there: else noise drives EPMs to and fro as fast as they can go."""
-_ROOM = 3.0
-"""Weight of EPMs that are too near to each other, there."""
-
 _ASTRAY = 1e-3
 """From which difference on, in metres and of unit vectors, EPMs that travel are not where they were believed to be."""
 
@@ -79,6 +75,8 @@ class Memory:
     """(N, 6) the last command."""
     paths: Floats
     """(2 M, N, 6) EPMs in each substep of the times of the last command but one, and of the last."""
+    trim: Floats
+    """(N, 6) where EPMs that travel are drawn to."""
 
 
 @dataclass
@@ -139,7 +137,7 @@ class Predictive:
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
         self._stages = min(4, max(1, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
-        self._home = ring(n_epm, _HOME_RADIUS_M, _HOME_TILT_RAD)
+        self._home = home_epms(n_epm)
         self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
         require(
@@ -147,6 +145,7 @@ class Predictive:
         )
         weights = _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)
         self._weights = np.concatenate([weights, SETTLING_S * weights])
+        self._trim = Trim(self._planner.model, self._planner.arms, self._planner.statics, self._weights)
         self._noise = _noise(self._plant)
         amiss = self._plant.mismatch * (_JUMPS_AMISS if self._plant.epms_jump else 1.0)
         self._pushed = _per_coordinate(_PUSH_N + _AMISS_N * amiss, _PUSH_NM + _AMISS_NM * amiss) ** 2
@@ -182,8 +181,8 @@ class Predictive:
                 memory = self._begin(measured, epms[i])
             else:
                 self._update(memory, measured, epms[i])
-            goal = self._goal(parts.reference[i].reshape(-1, COORDINATES), memory.before)
-            state.status[i] = self._decide(memory, goal, epms[i], rng)
+            references = self._references(parts.reference[i].reshape(-1, COORDINATES))
+            state.status[i] = self._decide(memory, references, epms[i], rng)
             state.rows[i] = memory
             command = memory.commands[0]
             actions[i] = pose_to_action(from_cartesian(command[:, :3], command[:, 3:]), self._system)
@@ -202,7 +201,7 @@ class Predictive:
         moments = np.full(len(epms) + 2, self._plant.mismatch**2 / 3.0)  # of a uniform distribution
         covariance = np.diag(np.concatenate([self._noise.measured, unknown, self._pushed, moments]))
         paths = np.repeat(epms[None], 2 * self._substeps, axis=0)
-        return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0), epms, paths)
+        return Memory(known, covariance, np.repeat(epms[None], self._stages, axis=0), epms, paths, epms)
 
     def _update(self, memory: Memory, measured: Floats, epms: Floats) -> None:
         """Carry the estimate over the last hold and correct it; one that was lost is begun anew."""
@@ -238,29 +237,39 @@ class Predictive:
         self._held.path[: len(path)] = path
         forecast(self._planner.model, self._held, 0, len(path), self._noise, known, covariance)
 
-    def _goal(self, references: Floats, before: Floats) -> Goal:
-        """Return the goal at the ends of the commands' times, from the references (5, 6) told.
-
-        ``before`` (N, 6) is the last command, from which the coming ones do not go farther than serves.
-        """
-        turn = np.diff(references, axis=0)
+    def _references(self, told: Floats) -> Floats:
+        """Return the states (H, 12) to be reached at the ends of the commands' times, from those told (5, 6)."""
+        turn = np.diff(told, axis=0)
         turn[:, 2::3] = np.remainder(turn[:, 2::3] + math.pi, 2 * math.pi) - math.pi
         rates = np.concatenate([1.5 * turn[:1] - 0.5 * turn[1:2], 0.5 * (turn[:-1] + turn[1:])]) / self._period_s
-        states = np.concatenate([references[:4], rates], axis=-1)
+        states: Floats = np.concatenate([told[:4], rates], axis=-1)
         share = self._lag / self._substeps  # commands act late, and so do their times end
         growth = np.diff(states[:, COORDINATES:], axis=0)
         states[:, :COORDINATES] += share * turn
         states[:, COORDINATES:] += share * np.concatenate([growth, growth[-1:]])
-        states = states[: self._stages]
-        home, pull, room = np.repeat(before[None], len(states), axis=0), 0.0, 0.0
-        if not self._plant.epms_jump:
-            robots = states[:, :COORDINATES].reshape(-1, 2, 3)
-            start_rows(0, len(states), np.ones(len(states), np.bool_), robots, self._home, home)
-            pull, room = math.hypot(_PULL, _STAY), _ROOM  # two squares, of the ways from home and from before, are one
-            home = before + (_PULL / pull) ** 2 * (home - before)
-        return Goal(np.array([self._substeps]), states[:, None], self._weights, home, pull, room)
+        return states[: self._stages]
 
-    def _decide(self, memory: Memory, goal: Goal, epms: Floats, rng: np.random.Generator) -> int:
+    def _goal(self, memory: Memory, references: Floats, pushing: Floats, rng: np.random.Generator) -> Goal:
+        """Return the goal of states (H, 12). EPMs that travel are to stay, and to come to a trim, kept in the memory.
+
+        ``pushing`` (6,) acts throughout, N and N m.
+        """
+        home, pull, room = memory.before, 0.0, 0.0
+        if not self._plant.epms_jump:
+            memory.trim = self._trim.follow(references[0], pushing, memory.trim, rng)
+            pull, room = math.hypot(_PULL, _STAY), ROOM  # two squares, of the ways from the trim and before, are one
+            home = home + (_PULL / pull) ** 2 * (memory.trim - home)
+        stages = len(references)
+        return Goal(
+            np.array([self._substeps]),
+            references[:, None],
+            self._weights,
+            np.repeat(home[None], stages, axis=0),
+            pull,
+            room,
+        )
+
+    def _decide(self, memory: Memory, references: Floats, epms: Floats, rng: np.random.Generator) -> int:
         """Write the best plan found into the memory; return how it was come by."""
         known, covariance, before = memory.known.copy(), memory.covariance.copy(), memory.before
         if self._lag > 0:  # until the command acts
@@ -270,6 +279,7 @@ class Predictive:
         elif self._plant.epms_jump and np.isfinite(epms).all():
             before = epms
         believe(self._planner.model, known[MOMENTS:])
+        goal = self._goal(memory, references, known[STATE:MOMENTS].copy(), rng)
         doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
         problem = Problem(known[:STATE].copy(), known[STATE:MOMENTS].copy(), doubt, goal, before)
         memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)

@@ -1,0 +1,38 @@
+"""EPM poses that hold the robots on their way by statics: their wrench is what drag and a push ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.actions import planar_target
+from magenv.allocation import allocate
+from magenv.params import InputError, Plant, System
+from magenv.poses import to_cartesian
+from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
+
+Floats = NDArray[np.float64]
+
+
+class Statics:
+    """Static holds on a nominal plant, found from random poses on."""
+
+    def __init__(self, system: System, plant: Plant) -> None:
+        self._system, body = system, plant.body
+        self._drag = np.array([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad] * 2)
+
+    def hold(self, coordinates: Floats, rates: Floats, pushing: Floats, rng: np.random.Generator) -> Floats | None:
+        """Return EPMs (N, 6) that hold the robots' coordinates (6,) at rates (6,), None where there are none.
+
+        ``pushing`` (6,) acts besides, N and N m.
+        """
+        target, positions = np.empty(WRENCH_SIZE), np.zeros((2, 3))
+        planar_target(self._drag * rates - pushing, coordinates[2], coordinates[5], target)
+        positions[:, :2] = coordinates.reshape(2, 3)[:, :2]
+        moments = planar_moments(coordinates[2::3], self._system.ipm_moment_am2)
+        try:
+            held = allocate(target, positions, moments, self._system, starts=1, seed=rng, components=IN_PLANE)
+        except InputError:  # robots on the same spot, or a state that is not finite
+            return None
+        epms: Floats = np.concatenate(to_cartesian(held.pose), axis=-1)
+        return epms
