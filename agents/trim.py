@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agents.statics import Statics
 from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, plan
-from magenv.manoeuvre import Arms
+from magenv.manoeuvre import Arms, allow
 from magenv.sensitivity import COORDINATES, Model
 
 Floats = NDArray[np.float64]
@@ -91,6 +91,7 @@ class Trim:
         marks = np.array([len(self._motion.which)])
         goal = Goal(marks, end[None, None], self._weights, last[None].copy(), NEAR, ROOM)
         trim = epms[None].copy()
+        allow(self._arms, last, trim[0])
         cost, _ = plan(
             self._model,
             start,

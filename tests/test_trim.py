@@ -1,0 +1,99 @@
+"""Trims: poses of the EPMs under which the robots stay by themselves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from foreseen import PAPER, UNMOVED, WEIGHTS, Floats
+from lane import magnets
+
+from agents.planner import Planner
+from agents.trim import Trim
+from magenv.forecast import STATE
+from magenv.params import PLANTS, Plant, System, TaskParams
+from magenv.poses import from_cartesian
+from magenv.stiffness import growth_rates, planar_stiffness
+from magenv.trajectories import approach
+from magenv.world import World
+from magenv.wrench import planar_moments
+
+SEPARATION = 0.030
+APART = np.array([[0.0, -SEPARATION / 2, 0.0], [0.0, SEPARATION / 2, 0.0]])
+"""Robots side by side, 30 mm apart."""
+RESTING = np.concatenate([APART.reshape(-1), np.zeros(6)])
+
+
+def trim_of(n_epm: int = 2, plant: Plant = PAPER) -> Trim:
+    """Trims on a plant, for control at 10 Hz."""
+    planner = Planner(System(n_epm=n_epm), plant, 0.1, round(0.1 / plant.substep_s), 2)
+    return Trim(planner.model, planner.arms, planner.statics, WEIGHTS)
+
+
+def found(trim: Trim, rng: np.random.Generator, pushing: Floats = UNMOVED, n_epm: int = 2, times: int = 60) -> Floats:
+    """The trim (N, 6) of resting robots after so many instants, from random EPMs on."""
+    epms = magnets(rng, System(n_epm=n_epm))
+    for _ in range(times):
+        epms = trim.follow(RESTING, pushing, epms, rng)
+    return epms
+
+
+def left_alone(epms: Floats, moved: Floats, seconds: float) -> Floats:
+    """Where robots (2, 3) are that were moved from side by side, after EPMs (N, 6) stood for so long."""
+    world = World(1, System(n_epm=len(epms)), PAPER, TaskParams(control_hz=1.0 / seconds, loss_distance_m=10.0))
+    robots = np.zeros((2, 6))
+    robots[:, :3] = APART + moved
+    world.start(0, approach(SEPARATION), robots, epms)
+    world.step(epms[None], np.ones(1, np.bool_))
+    return world.robots[0, :, :3] - APART
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_errors_die_away_while_the_epms_stand(rng: np.random.Generator, n_epm: int) -> None:
+    """In the plane, by the eigenvalues of the motion and on the plant: at 30 mm, where others lose control."""
+    epms = found(trim_of(n_epm), rng, n_epm=n_epm)
+    positions, system = np.zeros((2, 3)), System(n_epm=n_epm)
+    positions[:, :2] = APART[:, :2]
+    moments, pose = planar_moments(APART[:, 2], system.ipm_moment_am2), from_cartesian(epms[:, :3], epms[:, 3:])
+    rates = growth_rates(planar_stiffness(positions, moments, pose, system.epm_moment_am2), PAPER.body)
+    assert rates[0].real < 0.0
+    moved = np.array([[1e-3, -1e-3, math.radians(3.0)], [-1e-3, 1e-3, math.radians(-3.0)]])
+    late = left_alone(epms, moved, 5.0)
+    assert np.linalg.norm(late[:, :2], axis=1).max() < 0.5e-3
+    assert np.abs(late[:, 2]).max() < math.radians(1.0)
+
+
+def test_a_trim_bears_a_push(rng: np.random.Generator) -> None:
+    """The EPMs pull against what pushes: without it, the robots go the other way."""
+    pushing = np.array([0.0, 0.01, 0.0, 0.0, 0.01, 0.0])
+    moved = left_alone(found(trim_of(), rng, pushing), np.zeros((2, 3)), 0.5)
+    assert moved[:, 1].max() < -1e-3
+
+
+@pytest.mark.parametrize("plant", ["arm", "arm-reach"])
+def test_trims_keep_the_bounds(rng: np.random.Generator, plant: str) -> None:
+    system, trim = System(), trim_of(plant=PLANTS[plant])
+    for _ in range(10):
+        epms = found(trim, rng, times=3)
+        radii = np.linalg.norm(epms[:, :3], axis=1)
+        assert radii.min() > system.r_min_m - 1e-9
+        assert radii.max() < system.r_max_m + 1e-9
+        assert np.linalg.norm(epms[0, :3] - epms[1, :3]) > system.gap_min_m - 1e-9
+        np.testing.assert_allclose(np.linalg.norm(epms[:, 3:], axis=1), 1.0, rtol=0, atol=1e-12)
+
+
+def test_another_trim_is_taken_only_if_it_is_better(rng: np.random.Generator) -> None:
+    trim = trim_of()
+    for _ in range(20):
+        last = magnets(rng)
+        cost, kept = trim.improve(RESTING, UNMOVED, last, last)
+        start = RESTING.copy()
+        taken = trim.follow(start, UNMOVED, last, rng)
+        if not np.array_equal(taken, kept):
+            assert trim.improve(RESTING, UNMOVED, last, taken)[0] < cost
+
+
+def test_where_nothing_can_be_foreseen_the_trim_stays(rng: np.random.Generator) -> None:
+    trim, last = trim_of(), magnets(rng)
+    np.testing.assert_array_equal(trim.follow(np.full(STATE, np.nan), UNMOVED, last, rng), last)
