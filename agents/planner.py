@@ -1,8 +1,9 @@
 """Plans for the predictive controller: from the last plan, and where that does not converge, from elsewhere.
 
 Elsewhere are poses that hold the robots on their way by statics and, in turn, poses a little beside the best plan;
-from them, plans are made for longer and longer parts of the command's time, in which errors grow less than in the
-whole of it. EPMs that travel come only to what is near: there, all of the best plan is moved a little.
+from them, plans are made first for a part of the command's time, in which errors grow less than in the whole of it, and
+with as much doubt of the state as a trim has, so that they begin where errors grow least. EPMs that travel come only to
+what is near: there, all of the best plan is moved a little.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.statics import Statics
-from agents.trim import beside
+from agents.trim import DOUBT, beside
 from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms, allow, move
@@ -181,7 +182,7 @@ class Planner:
         if command is None:
             return math.inf, problem.before[None]
         allow(self.arms, problem.before, command[0])  # it may be out of the arms' reach
-        ahead, none, cost = problem.ahead(), np.zeros((STATE, STATE)), math.inf
+        ahead, cost = problem.ahead(), math.inf
         for motion in (*self._parts, self._motion):
             whole = motion is self._motion
             share = len(motion.which) / len(self._motion.which)
@@ -191,7 +192,7 @@ class Planner:
                 self.model,
                 problem.state,
                 problem.pushing,
-                problem.doubt if whole else none,
+                problem.doubt if whole else DOUBT,
                 problem.goal if whole else part,
                 self.arms,
                 motion,

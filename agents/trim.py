@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.statics import Statics
-from magenv.forecast import STATE, Course, Goal
+from magenv.forecast import Course, Goal
 from magenv.horizon import Scratch, plan
 from magenv.manoeuvre import Arms, allow
 from magenv.sensitivity import COORDINATES, Model
@@ -22,8 +22,8 @@ STAND_S = 0.5
 """Time over which the EPMs are to stand still."""
 AHEAD_S = 1.0
 """A trim is for where the robots should be so much later: the EPMs need time to come to it."""
-DOUBT = np.array([1e-3, 1e-3, 0.03] * 2)
-"""Errors of the robots' coordinates, m and rad, whose growth a trim is chosen by."""
+DOUBT = np.diag([1e-3, 1e-3, 0.03] * 2 + [0.0] * COORDINATES)
+"""(12, 12) root of a state's covariance, m and rad, by whose growth a trim is chosen: errors of the coordinates."""
 NEAR = 0.3
 """Weight of the way from the last trim."""
 ROOM = 3.0
@@ -59,8 +59,6 @@ class Trim:
         self._statics = statics
         self._motion = Course.of(n, max(1, round(STAND_S / model.substep)), False)
         self._scratch = Scratch.of(1, n, 1)
-        self._doubt = np.zeros((STATE, STATE))
-        self._doubt[:COORDINATES, :COORDINATES] = np.diag(DOUBT)
 
     def follow(self, state: Floats, pushing: Floats, last: Floats, rng: np.random.Generator) -> Floats:
         """Return the trim (N, 6) for robots on their way, after the ``last`` (N, 6), or a better one beside it.
@@ -96,7 +94,7 @@ class Trim:
             self._model,
             start,
             pushing,
-            self._doubt,
+            DOUBT,
             goal,
             self._arms,
             self._motion,
