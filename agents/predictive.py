@@ -29,7 +29,8 @@ from magenv.task import Frame, Layout, ObservationMode, unpack
 Floats = NDArray[np.float64]
 
 HORIZON_S = 0.2
-"""Commands are planned for so long a time, one at least."""
+"""Commands are planned for so long a time; one at least, two where EPMs travel: where they end tells where they begin
+the next."""
 POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
 """Errors that count one, and the time in which an error of the rate would make them."""
 # What finite numbers and the neglected curvature of the motion leave in doubt, however exact the plant is.
@@ -52,6 +53,8 @@ _PULL = 0.6
 little."""
 _STAY = 3.0
 """Weight of the way from the last command, there: else noise drives EPMs to and fro as fast as they can go."""
+_ABSURD = 1e3
+"""Number from which on an observation tells nothing: all are of the order of one."""
 _ASTRAY = 1e-3
 """From which difference on, in metres and of unit vectors, EPMs that travel are not where they were believed to be."""
 
@@ -135,7 +138,7 @@ class Predictive:
         self._period_s = period = TaskParams(control_hz=control_hz).period_s
         self._layout = Layout(self._system, self._plant.workspace_radius_m, period, self.observation, self.frame)
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
-        self._stages = min(4, max(1, round(HORIZON_S / period)))
+        self._stages = min(4, max(1 if self._plant.epms_jump else 2, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
         self._home = home_epms(n_epm)
         self._held = Course.of(n_epm, self._substeps, True)
@@ -145,7 +148,10 @@ class Predictive:
         )
         weights = _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)
         self._weights = np.concatenate([weights, SETTLING_S * weights])
-        self._trim = Trim(self._planner.model, self._planner.arms, self._planner.statics, self._weights)
+        planner = self._planner
+        self._trim = (
+            None if self._plant.epms_jump else Trim(planner.model, planner.arms, planner.statics, self._weights)
+        )
         self._noise = _noise(self._plant)
         amiss = self._plant.mismatch * (_JUMPS_AMISS if self._plant.epms_jump else 1.0)
         self._pushed = _per_coordinate(_PUSH_N + _AMISS_N * amiss, _PUSH_NM + _AMISS_NM * amiss) ** 2
@@ -167,7 +173,7 @@ class Predictive:
     ) -> tuple[NDArray[np.float32], PredictiveState]:
         """Return the ``pose`` actions (n, 5 N) for observations (n, d), or (5 N,) for (d,), and the new state."""
         batch = np.atleast_2d(observation)
-        batch = np.where(np.isfinite(batch), batch, np.float32(np.nan))  # infinite numbers tell no more
+        batch = np.where(np.abs(batch) < _ABSURD, batch, np.float32(np.nan))  # such numbers tell no more
         parts = unpack(batch, self._layout)
         n = len(batch)
         if state is None:
@@ -255,7 +261,7 @@ class Predictive:
         ``pushing`` (6,) acts throughout, N and N m.
         """
         home, pull, room = memory.before, 0.0, 0.0
-        if not self._plant.epms_jump:
+        if self._trim is not None:
             memory.trim = self._trim.follow(references[0], pushing, memory.trim, rng)
             pull, room = math.hypot(_PULL, _STAY), ROOM  # two squares, of the ways from the trim and before, are one
             home = home + (_PULL / pull) ** 2 * (memory.trim - home)

@@ -22,9 +22,9 @@ class Statics:
         self._drag = np.array([body.drag_linear_nspm, body.drag_linear_nspm, body.drag_rotational_nmsprad] * 2)
 
     def hold(self, coordinates: Floats, rates: Floats, pushing: Floats, rng: np.random.Generator) -> Floats | None:
-        """Return EPMs (N, 6) that hold the robots' coordinates (6,) at rates (6,), None where there are none.
+        """Return EPMs (N, 6) that hold the robots' coordinates (6,) at rates (6,), as nearly as a search finds.
 
-        ``pushing`` (6,) acts besides, N and N m.
+        ``pushing`` (6,) acts besides, N and N m. Moments are the nominal ones. None where nothing can be sought.
         """
         target, positions = np.empty(WRENCH_SIZE), np.zeros((2, 3))
         planar_target(self._drag * rates - pushing, coordinates[2], coordinates[5], target)

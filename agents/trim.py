@@ -1,4 +1,5 @@
-"""Trims: EPM poses under which the robots keep to their way by themselves for a while.
+"""Trims: EPM poses under which the robots keep to their way by themselves for a while, as near to a stable equilibrium
+in the plane as there is.
 
 By Earnshaw's theorem no hold is stable in all directions. But the robots stay in their plane, which bears what is
 unstable across it, and in the plane errors may even die away while the EPMs stand still. Such poses lie far from most
@@ -31,7 +32,7 @@ ROOM = 3.0
 ITERATIONS = 8
 """Of a descent."""
 WELL = 0.5
-"""Cost from which on trims are sought elsewhere too: by statics, and in turn beside the last one."""
+"""Cost from which on a trim is sought elsewhere too: by statics or beside the one that was found, as the dice fall."""
 BESIDE = np.repeat([0.1, 1.0], 3)
 """How far beside: standard deviations of an EPM's position (m) and moment."""
 BETTER = 0.8
@@ -61,7 +62,7 @@ class Trim:
         self._scratch = Scratch.of(1, n, 1)
 
     def follow(self, state: Floats, pushing: Floats, last: Floats, rng: np.random.Generator) -> Floats:
-        """Return the trim (N, 6) for robots on their way, after the ``last`` (N, 6), or a better one beside it.
+        """Return the trim (N, 6) for robots on their way, from the ``last`` (N, 6) on, or a better one elsewhere.
 
         ``state`` (12,) is where the robots should be, with their rates; ``pushing`` (6,) acts besides, N and N m.
         """
@@ -70,9 +71,11 @@ class Trim:
         cost, trim = self.improve(start, pushing, last, last)
         if not cost > WELL:
             return trim
-        elsewhere: Floats | None = beside(trim, BESIDE, rng)
+        elsewhere: Floats | None
         if rng.random() < 0.5:
             elsewhere = self._statics.hold(start[:COORDINATES], start[COORDINATES:], pushing, rng)
+        else:
+            elsewhere = beside(trim, BESIDE, rng)
         if elsewhere is None:
             return trim
         other, found = self.improve(start, pushing, last, elsewhere)
@@ -82,7 +85,7 @@ class Trim:
         """Return the cost of a trim for a state (12,), and the trim (N, 6), found by descent from EPMs (N, 6).
 
         The cost is that of the errors after ``STAND_S``, of what ``DOUBT`` has grown to by then, and of the way from
-        the ``last`` trim (N, 6). It is infinite where nothing can be foreseen; the trim is then the EPMs given.
+        the ``last`` trim (N, 6). It is infinite where nothing can be foreseen; the trim is then the EPMs given, within their bounds.
         """
         end = start.copy()
         end[:COORDINATES] += STAND_S * start[COORDINATES:]

@@ -30,7 +30,7 @@ class Goal(NamedTuple):
     home: Floats
     """(H, N, 6) EPMs that commands are drawn to."""
     pull: float
-    """Weight of the way from there, per rad and per 0.1 m of radius."""
+    """Weight of the way from there, per 0.1 m of the centres and per unit of the unit moments."""
     room: float
     """Weight of EPMs nearer to each other than they should be, per cm."""
 

@@ -281,7 +281,8 @@ def unpack(observation: ArrayLike, layout: Layout) -> Parts:
     errors = planar(error, ERROR_SCALE_M, np.arctan2(error[..., 2], error[..., 3]))
     target = (robots + errors)[..., None, :, :]
     later = target + planar(preview, PREVIEW_SCALE_M, preview[..., 2])
-    directions = epm[..., :3] / np.linalg.norm(epm[..., :3], axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # zeros tell no direction, and become NaN
+        directions = epm[..., :3] / np.linalg.norm(epm[..., :3], axis=-1, keepdims=True)
     x, y = globally(directions[..., 0], directions[..., 1])
     radius = epm[..., 3] * layout.system.r_max_m
     mx, my = globally(epm[..., 4], epm[..., 5])

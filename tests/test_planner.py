@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foreseen import CERTAIN, PAPER, UNMOVED, WEIGHTS, Floats, at_home, end_of, goal_of, held, on_the_way
+from lane import magnets
 
-from agents.planner import ENOUGH, Planner, Problem
-from magenv.params import System
+from agents.planner import ENOUGH, TROUBLE, Planner, Problem
+from magenv.manoeuvre import allow
+from magenv.params import PLANTS, System
 
 HOLD_S, SUBSTEPS, SETTLING = 0.1, 20, np.repeat([1.0, 0.2], 6)
 
@@ -102,3 +104,21 @@ def test_the_way_ahead_is_the_shorter_one_round() -> None:
     expected = problem.goal.references[0, 0, :6] - problem.state[:6]
     expected[[2, 5]] = [2 * math.pi - 6.0, 6.0 - 2 * math.pi]
     np.testing.assert_allclose(problem.ahead(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("plant", ["moving", "arm", "arm-reach"])
+def test_every_command_of_a_plan_is_one_that_is_allowed(rng: np.random.Generator, plant: str) -> None:
+    """Radii, gap, reach and speed are kept from each command to the next: to allow them changes nothing."""
+    planner, troubled = Planner(System(), PLANTS[plant], HOLD_S, SUBSTEPS, 2), 0
+    for _ in range(10):
+        problem = replace(a_problem(2), before=magnets(rng))
+        allow(planner.arms, problem.before.copy(), problem.before)
+        commands, cost, _ = planner.plan(problem, np.repeat(problem.before[None], 2, axis=0), rng)
+        troubled += cost > TROUBLE * 2
+        before = problem.before
+        for command in commands:
+            once = command.copy()
+            allow(planner.arms, before, once)
+            np.testing.assert_allclose(once, command, rtol=0, atol=1e-9)
+            before = command
+    assert troubled > 0  # some were sought elsewhere

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from rollouts import MakeEnv
 
-from agents import planner, predictive
+from agents import planner, predictive, statics, trim
 from agents.baseline import tuned_baseline
 from agents.catalogue import controller
 from agents.predictive import CONVERGED, FALLBACK, SOUGHT, UNSOLVED, Predictive, PredictiveState
@@ -256,7 +256,7 @@ def test_what_could_not_be_foreseen_once_is_over_with_the_next_observation(make_
 
 
 @pytest.mark.parametrize("plant", ["paper", "arm"])
-@pytest.mark.parametrize("nothing", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("nothing", [math.nan, -math.inf, 1e30])
 def test_what_tells_nothing_moves_nothing_unforeseen(make_env: MakeEnv, plant: str, nothing: float) -> None:
     """At first an action, later the last command; with the next observation it is over."""
     observation, agent = (
@@ -276,17 +276,18 @@ def test_what_tells_nothing_moves_nothing_unforeseen(make_env: MakeEnv, plant: s
 
 @pytest.mark.parametrize("seed", [11, 15])
 def test_whatever_is_observed_there_is_an_action(make_env: MakeEnv, seed: int) -> None:
-    """Observations drawn from the whole space, one after the other as if they belonged together."""
+    """Zeros, then observations drawn from the whole space, as if they belonged together."""
     env, agent, state = make_env(scenario="approach-60"), Predictive(), None
     env.observation_space.seed(seed)
-    for _ in range(2):
-        action, state = agent.predict(env.observation_space.sample(), state)
+    for _ in range(3):
+        observation = env.observation_space.sample() if state is not None else np.zeros_like(first(env, 0))
+        action, state = agent.predict(observation, state)
         assert state.status[0] in (CONVERGED, SOUGHT, UNSOLVED, FALLBACK)
         assert np.isfinite(action).all()
         assert np.abs(action).max() <= 1.0
 
 
-@pytest.mark.parametrize("module", [predictive, planner])
+@pytest.mark.parametrize("module", [predictive, planner, trim, statics])
 def test_it_imports_neither_plant_nor_environment(module: Any) -> None:
     """It foresees through ``forecast``; what the episodes' world is in truth it cannot ask."""
     tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))

@@ -6,16 +6,18 @@ import math
 
 import numpy as np
 import pytest
-from foreseen import PAPER, UNMOVED, WEIGHTS, Floats
+from foreseen import PAPER, UNMOVED, WEIGHTS, Floats, end_of, held as standing
 from lane import magnets
 
 from agents.planner import Planner
-from agents.trim import Trim
+from agents.trim import AHEAD_S, NEAR, STAND_S, Trim
 from magenv.forecast import STATE
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.poses import from_cartesian
+from magenv.reach import beyond_reach
 from magenv.stiffness import growth_rates, planar_stiffness
 from magenv.trajectories import approach
+from magenv.travel import Motion
 from magenv.world import World
 from magenv.wrench import planar_moments
 
@@ -104,16 +106,43 @@ def test_trims_keep_the_bounds(rng: np.random.Generator, plant: str) -> None:
         assert radii.max() < system.r_max_m + 1e-9
         assert np.linalg.norm(epms[0, :3] - epms[1, :3]) > system.gap_min_m - 1e-9
         np.testing.assert_allclose(np.linalg.norm(epms[:, 3:], axis=1), 1.0, rtol=0, atol=1e-12)
+        assert beyond_reach(epms, Motion.of(system, PLANTS[plant], 1e-3, 1).shell, False) < 1e-6
 
 
 def test_another_trim_is_taken_only_if_it_is_better(rng: np.random.Generator) -> None:
-    trim = trim_of()
+    trim, others = trim_of(), 0
     for _ in range(20):
         last = magnets(rng)
         cost, kept = trim.improve(RESTING, UNMOVED, last, last)
         taken = trim.follow(RESTING, UNMOVED, last, rng)
         if not np.array_equal(taken, kept):
+            others += 1
             assert trim.improve(RESTING, UNMOVED, last, taken)[0] < cost
+
+
+def test_a_trim_is_for_where_robots_will_be_and_keeps_them_on_their_way(rng: np.random.Generator) -> None:
+    """Robots that go and turn: with the EPMs standing, they are where they should be after half a second."""
+    trim, going, epms = trim_of(), RESTING.copy(), magnets(rng)
+    going[6:] = [4e-3, 1e-3, 0.03, 4e-3, -1e-3, -0.03]
+    for _ in range(60):
+        epms = trim.follow(going, UNMOVED, epms, rng)
+    start, late = going.copy(), going.copy()
+    start[:6] += AHEAD_S * going[6:]
+    late[:6] += (AHEAD_S + STAND_S) * going[6:]
+    lands = end_of(trim_of()._model, start, UNMOVED, standing(epms, round(STAND_S / PAPER.substep_s)))
+    far = end_of(trim_of()._model, going, UNMOVED, standing(epms, round(STAND_S / PAPER.substep_s)))
+    assert np.abs(lands[:6] - late[:6]).max() < 0.5 * np.abs(late[:6] - start[:6]).max()
+    assert np.linalg.norm(lands[:6] - late[:6]) < np.linalg.norm(far[:6] - going[:6] - STAND_S * going[6:])
+
+
+def test_a_trim_stays_near_the_last(rng: np.random.Generator) -> None:
+    """Of the way from the last one, which costs, less is gone than without that cost."""
+    trim, last, ways = trim_of(), magnets(rng), []
+    for weight in (NEAR, 100.0 * NEAR):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("agents.trim.NEAR", weight)
+            ways.append(np.linalg.norm(trim.improve(RESTING, UNMOVED, last, last)[1] - last))
+    assert ways[1] < 0.1 * ways[0]
 
 
 def test_where_nothing_can_be_foreseen_the_trim_stays(rng: np.random.Generator) -> None:
