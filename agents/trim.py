@@ -1,7 +1,7 @@
-"""Trims: EPM poses under which the robots keep to their way by themselves for a while, as near to a stable equilibrium
-in the plane as there is.
+"""Trims: EPM poses under which the robots keep to their way by themselves for a while.
 
-By Earnshaw's theorem no hold is stable in all directions. But the robots stay in their plane, which bears what is
+A trim is as near to a stable equilibrium in the plane as there is. By Earnshaw's theorem no hold is stable in all
+directions. But the robots stay in their plane, which bears what is
 unstable across it, and in the plane errors may even die away while the EPMs stand still. Such poses lie far from most
 others that hold the robots; EPMs that travel are to be near them in time, for commands that come late do no harm there.
 """
@@ -85,7 +85,8 @@ class Trim:
         """Return the cost of a trim for a state (12,), and the trim (N, 6), found by descent from EPMs (N, 6).
 
         The cost is that of the errors after ``STAND_S``, of what ``DOUBT`` has grown to by then, and of the way from
-        the ``last`` trim (N, 6). It is infinite where nothing can be foreseen; the trim is then the EPMs given, within their bounds.
+        the ``last`` trim (N, 6). It is infinite where nothing can be foreseen; the trim is then the EPMs given, within
+        their bounds.
         """
         end = start.copy()
         end[:COORDINATES] += STAND_S * start[COORDINATES:]
