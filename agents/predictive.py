@@ -29,8 +29,8 @@ from magenv.task import Frame, Layout, ObservationMode, unpack
 Floats = NDArray[np.float64]
 
 HORIZON_S = 0.2
-"""Commands are planned for so long a time; one at least, two where EPMs travel: where they end tells where they begin
-the next."""
+"""Commands are planned for so long a time; one at least, two where EPMs travel and one takes no longer than that: where
+they end the one they begin the next."""
 POSITION_M, HEADING_RAD, SETTLING_S = 1e-3, 0.03, 0.02
 """Errors that count one, and the time in which an error of the rate would make them."""
 # What finite numbers and the neglected curvature of the motion leave in doubt, however exact the plant is.
@@ -138,7 +138,8 @@ class Predictive:
         self._period_s = period = TaskParams(control_hz=control_hz).period_s
         self._layout = Layout(self._system, self._plant.workspace_radius_m, period, self.observation, self.frame)
         self._substeps = max(1, math.ceil(period / self._plant.substep_s - 1e-9))
-        self._stages = min(4, max(1 if self._plant.epms_jump else 2, round(HORIZON_S / period)))
+        least = 1 if self._plant.epms_jump or period > HORIZON_S else 2
+        self._stages = min(4, max(least, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
         self._home = home_epms(n_epm)
         self._held = Course.of(n_epm, self._substeps, True)

@@ -87,6 +87,11 @@ def test_a_first_plan_that_goes_wrong_is_sought_again_where_epms_travel() -> Non
     assert record.success
 
 
+def test_it_holds_with_arms_at_five_hertz() -> None:
+    (record,) = run(Predictive(2, 5.0, "arm"), "approach-60", "arm", control_hz=5.0, episodes=1, seed=2)
+    assert record.success
+
+
 def test_epms_that_are_slower_than_believed_are_seen() -> None:
     slow = "moving:epm_speed_mps=0.5,epm_turn_radps=1.57"
     (record,) = run(Predictive(2, 2.0, "moving"), "approach-60", slow, episodes=1, seed=0)
