@@ -1,9 +1,9 @@
 """Trims: EPM poses under which the robots keep to their way by themselves for a while.
 
 A trim is as near to a stable equilibrium in the plane as there is. By Earnshaw's theorem no hold is stable in all
-directions. But the robots stay in their plane, which bears what is
-unstable across it, and in the plane errors may even die away while the EPMs stand still. Such poses lie far from most
-others that hold the robots; EPMs that travel are to be near them in time, for commands that come late do no harm there.
+directions. But the robots stay in their plane, which bears what is unstable across it, and in the plane errors may even
+die away while the EPMs stand still. Such poses lie far from most others that hold the robots; EPMs that travel are to
+be near them in time, for commands that come late do no harm there.
 """
 
 from __future__ import annotations
