@@ -2,7 +2,7 @@
 
 Elsewhere are poses that hold the robots on their way by statics and, in turn, poses a little beside the best plan;
 from them, plans are made first for a part of the command's time, in which errors grow less than in the whole of it, and
-with as much doubt of the state as a trim has, so that they begin where errors grow least. EPMs that travel come only to
+with the doubt of the state that trims have, so that they begin where errors grow least. EPMs that travel come only to
 what is near: there, all of the best plan is moved a little.
 """
 
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.statics import Statics
-from agents.trim import DOUBT, beside
+from agents.searches import DOUBT, Statics, beside
 from magenv.forecast import STATE, Course, Goal
 from magenv.horizon import Scratch, land, plan
 from magenv.manoeuvre import Arms, allow, move

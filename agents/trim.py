@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.statics import Statics
+from agents.searches import DOUBT, Statics, beside
 from magenv.forecast import Course, Goal
 from magenv.horizon import Scratch, plan
 from magenv.manoeuvre import Arms, allow
@@ -23,8 +23,6 @@ STAND_S = 0.5
 """Time over which the EPMs are to stand still."""
 AHEAD_S = 1.0
 """A trim is for where the robots should be so much later: the EPMs need time to come to it."""
-DOUBT = np.diag([1e-3, 1e-3, 0.03] * 2 + [0.0] * COORDINATES)
-"""(12, 12) root of a state's covariance, m and rad, by whose growth a trim is chosen: errors of the coordinates."""
 NEAR = 0.3
 """Weight of the way from the last trim."""
 ROOM = 3.0
@@ -109,10 +107,3 @@ class Trim:
             trim,
         )
         return cost, trim[0]
-
-
-def beside(epms: Floats, deviation: Floats, rng: np.random.Generator) -> Floats:
-    """Return EPMs (..., 6) a little beside the given ones, by standard deviations (6,)."""
-    moved: Floats = epms + rng.normal(size=epms.shape) * deviation
-    moved[..., 3:] /= np.linalg.norm(moved[..., 3:], axis=-1, keepdims=True)
-    return moved

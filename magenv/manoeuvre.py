@@ -16,7 +16,7 @@ from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M, keeps_gap
 from magenv.reach import COMMAND_MARGIN_M, narrowed, project_reach, room, shoulder, stays
 from magenv.travel import Motion
-from magenv.ways import ramp, way_round
+from magenv.ways import longest_way, ramp, share_gone, way_round
 
 Floats = NDArray[np.float64]
 
@@ -42,26 +42,6 @@ class Arms(NamedTuple):
     def of(cls, system: System, plant: Plant, substep_s: float, substeps: int) -> Arms:
         """Return the limits of a system on a plant, for commands of so many substeps."""
         return cls(Motion.of(system, plant, substep_s, substeps), substeps, not plant.epms_jump)
-
-
-@kernel
-def _share(j: int, up: int, flat: int) -> float:
-    """Return the share of a move that is done after ``j`` substeps, see ``travel.ramp``."""
-    rising = min(j, up)
-    even = min(max(j - up, 0), flat)
-    falling = min(max(j - up - flat, 0), up - 1)
-    done = rising * (rising + 1) // 2 + up * even + falling * up - falling * (falling + 1) // 2
-    return done / (up * (up + flat))
-
-
-@kernel
-def _longest(rise: float, substeps: int) -> float:
-    """Return the longest way, in substeps at full speed, that is gone in so many."""
-    full = max(1, math.ceil(1.0 / rise))
-    if substeps >= 2 * full - 1:
-        return 1.0 * (substeps - full + 1)
-    up = (substeps + 1) // 2
-    return rise * up * up
 
 
 @kernel
@@ -98,7 +78,7 @@ def _go_part(
     ends = ((cosine * t[0] - sine * u[0], cosine * t[1] - sine * u[1], cosine * t[2] - sine * u[2]), t)
     rows = len(motion.path)
     for j in range(rows + 1):
-        share = _share(j, up, flat)
+        share = share_gone(j, up, flat)
         s, c = sincos(share * angle)
         radius = near + share * out
         for i in range(3):
@@ -230,7 +210,7 @@ def _keeps_apart(arms: Arms, before: Floats, command: Floats, least: float) -> b
     for j in range(arms.substeps):
         for k in range(n):
             up, flat = ramp(lengths[k] / limits.reach, limits.rise)
-            _go_share(before[k, :3], command[k, :3], _share(j, up, flat), place[0, k, :3])
+            _go_share(before[k, :3], command[k, :3], share_gone(j, up, flat), place[0, k, :3])
         if not keeps_gap(place, 0, least):
             return False
     return True
@@ -248,7 +228,7 @@ def allow(arms: Arms, before: Floats, command: Floats) -> None:
     if not arms.travels:
         return
     goal, shares = command.copy(), np.empty(len(command))
-    reach, turn = _longest(limits.rise, arms.substeps), _longest(limits.turn_rise, arms.substeps)
+    reach, turn = longest_way(limits.rise, arms.substeps), longest_way(limits.turn_rise, arms.substeps)
     for k in range(len(command)):
         if limits.shell.outer < math.inf:
             _bend(limits, k, before, goal, limits.reach * reach)

@@ -201,12 +201,6 @@ def robots_frame(heading_1: float, heading_2: float) -> float:
     return arctan2(s, c)
 
 
-def ring(n_epm: int, radius_m: float, tilt_rad: float) -> Floats:
-    """Return EPMs (N, 6) evenly on a ring round the x axis, the first raised by a tilt, moments against the axis."""
-    angles = tilt_rad + 2 * math.pi * np.arange(n_epm) / n_epm
-    return np.array([[0.0, radius_m * math.cos(a), radius_m * math.sin(a), -1.0, 0.0, 0.0] for a in angles])
-
-
 def home_pose(n_epm: int) -> Floats:
     """Return the home pose vector (5 N) in the robots' frame, whose x axis is the heading.
 
@@ -215,8 +209,10 @@ def home_pose(n_epm: int) -> Floats:
     """
     require(n_epm in HOME_TILT_RAD, "n_epm", "2 or 3", n_epm)
     poses = np.empty((n_epm, POSE_SIZE))
-    for epm, pose in zip(ring(n_epm, HOME_RADIUS_M, HOME_TILT_RAD[n_epm]), poses, strict=True):
-        epm_to_pose(epm, pose)
+    for k, pose in enumerate(poses):
+        angle = HOME_TILT_RAD[n_epm] + 2 * math.pi * k / n_epm
+        place = (0.0, HOME_RADIUS_M * math.cos(angle), HOME_RADIUS_M * math.sin(angle))
+        epm_to_pose(np.array([*place, -1.0, 0.0, 0.0]), pose)
     return poses.reshape(-1)
 
 

@@ -87,6 +87,26 @@ def ramp(way: float, rise: float) -> tuple[int, int]:
     return up, max(0, math.ceil(way - up - _LESS))
 
 
+@kernel
+def share_gone(j: int, up: int, flat: int) -> float:
+    """Return the share of a move that is done after ``j`` substeps, by its ``ramp``."""
+    rising = min(j, up)
+    even = min(max(j - up, 0), flat)
+    falling = min(max(j - up - flat, 0), up - 1)
+    done = rising * (rising + 1) // 2 + up * even + falling * up - falling * (falling + 1) // 2
+    return done / (up * (up + flat))
+
+
+@kernel
+def longest_way(rise: float, substeps: int) -> float:
+    """Return the longest way, in substeps at full speed, whose ``ramp`` takes no more than so many."""
+    full = max(1, math.ceil(1.0 / rise - _LESS))
+    if substeps >= 2 * full - 1:
+        return 1.0 * (substeps - full + 1)
+    up = (substeps + 1) // 2
+    return rise * up * up
+
+
 @law
 def set_way(lanes: Floats, i: int, w: int, u: Vector, across: Vector, angle: float, up: int, flat: int) -> None:
     """Write the way whose fields begin at ``w``: from unit vector u by ``angle`` (rad)."""

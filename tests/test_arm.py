@@ -21,6 +21,7 @@ from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.trajectories import approach
 from magenv.vector_env import TwoRobotsVector
+from magenv.ways import longest_way, ramp, share_gone
 from magenv.world import World
 
 Floats = NDArray[np.float64]
@@ -165,11 +166,27 @@ def test_parameters_are_drawn_within_the_mismatch() -> None:
         assert len(np.unique(factor)) == factor.size, name
 
 
-@pytest.mark.parametrize("action", ["home", "pose"])
+@pytest.mark.parametrize("rise", [0.025, 0.0159, 0.3, 1.0, 2.5])
+def test_the_longest_way_is_the_last_that_its_ramp_does_in_time(rise: float) -> None:
+    """At the end all of it is gone, and no step is longer than full speed allows."""
+    for substeps in range(1, 200):
+        longest = longest_way(rise, substeps)
+        up, flat = ramp(longest, rise)
+        assert 2 * up - 1 + flat <= substeps
+        up_over, flat_over = ramp(longest * (1.0 + 1e-6), rise)
+        assert 2 * up_over - 1 + flat_over > substeps
+        gone = np.array([share_gone(j, up, flat) for j in range(substeps + 1)])
+        assert gone[0] == 0.0
+        assert gone[-1] == 1.0
+        assert np.diff(gone).max() * longest <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+@pytest.mark.parametrize("action", ["home", "pose", "step", "wrench"])
 def test_without_all_that_is_hard_it_is_the_papers_plant(
-    monkeypatch: pytest.MonkeyPatch, action: Any, rng: np.random.Generator
+    monkeypatch: pytest.MonkeyPatch, action: Any, n_epm: int
 ) -> None:
-    """Infinite speeds, no latency, no noise, no mismatch: the same bits."""
+    """Infinite speeds, no latency, no noise, no mismatch: the same bits, over losses and new episodes."""
     easy = dataclasses.replace(
         ARM,
         epm_speed_mps=math.inf,
@@ -182,11 +199,15 @@ def test_without_all_that_is_hard_it_is_the_papers_plant(
         mismatch=0.0,
     )
     monkeypatch.setitem(PLANTS, "arm", easy)
-    actions, told = rng.uniform(-0.1, 0.1, (3, 8, 10)).astype(np.float32), []
+    told, steps = [], 6 if action == "wrench" else 40  # each of a wrench is an optimisation
     for plant in ("paper", "arm"):
-        envs = TwoRobotsVector(8, plant=plant, action=action, control_hz=20.0)
-        observations = [envs.reset(seed=5)[0], *(envs.step(each)[0] for each in actions)]
-        told.append(np.array(observations).tobytes())
+        envs, seen = TwoRobotsVector(4, n_epm=n_epm, plant=plant, action=action, control_hz=20.0), []
+        seen.append(envs.reset(seed=5)[0].tobytes())
+        actions = np.random.default_rng(1).uniform(-0.1, 0.1, (steps, *envs.action_space.shape))
+        for each in actions.astype(np.float32):
+            observation, reward, lost, ended, _ = envs.step(each)
+            seen.append(b"".join(part.tobytes() for part in (observation, reward, lost, ended)))
+        told.append(seen)
     assert told[0] == told[1]
 
 

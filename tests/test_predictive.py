@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from rollouts import MakeEnv
 
-from agents import planner, predictive, statics, trim
+from agents import planner, predictive, searches, trim
 from agents.baseline import tuned_baseline
 from agents.catalogue import controller
 from agents.predictive import CONVERGED, FALLBACK, SOUGHT, UNSOLVED, Predictive, PredictiveState
@@ -292,7 +292,7 @@ def test_whatever_is_observed_there_is_an_action(make_env: MakeEnv, seed: int) -
         assert np.abs(action).max() <= 1.0
 
 
-@pytest.mark.parametrize("module", [predictive, planner, trim, statics])
+@pytest.mark.parametrize("module", [predictive, planner, trim, searches])
 def test_it_imports_neither_plant_nor_environment(module: Any) -> None:
     """It foresees through ``forecast``; what the episodes' world is in truth it cannot ask."""
     tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))

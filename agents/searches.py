@@ -1,4 +1,7 @@
-"""EPM poses that hold the robots on their way by statics: their wrench is what drag and a push ask for."""
+"""Where plans and trims are sought: poses that hold the robots by statics, poses a little beside others.
+
+And by what they are compared before it is known how well the state is: the growth of a doubt that is always the same.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,17 @@ from magenv.actions import planar_target
 from magenv.allocation import allocate
 from magenv.params import InputError, Plant, System
 from magenv.poses import to_cartesian
+from magenv.sensitivity import COORDINATES
 from magenv.wrench import IN_PLANE, WRENCH_SIZE, planar_moments
 
 Floats = NDArray[np.float64]
 
+DOUBT = np.diag([1e-3, 1e-3, 0.03] * 2 + [0.0] * COORDINATES)
+"""(12, 12) root of a state's covariance: errors of the coordinates, m and rad, none of the rates."""
+
 
 class Statics:
-    """Static holds on a nominal plant, found from random poses on."""
+    """Static holds on a nominal plant, found from random poses on: their wrench is what drag and a push ask for."""
 
     def __init__(self, system: System, plant: Plant) -> None:
         self._system, body = system, plant.body
@@ -36,3 +43,10 @@ class Statics:
             return None
         epms: Floats = np.concatenate(to_cartesian(held.pose), axis=-1)
         return epms
+
+
+def beside(epms: Floats, deviation: Floats, rng: np.random.Generator) -> Floats:
+    """Return EPMs (..., 6) a little beside the given ones, by standard deviations (6,)."""
+    moved: Floats = epms + rng.normal(size=epms.shape) * deviation
+    moved[..., 3:] /= np.linalg.norm(moved[..., 3:], axis=-1, keepdims=True)
+    return moved
