@@ -25,12 +25,14 @@ from magenv.env import TwoRobots
 from magenv.params import PLANTS, Body, Plant
 
 if TYPE_CHECKING:
+    from climbs import Climbed, Outcomes, Told
     from rollouts import MakeEnv
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
     from tiny_runs import MakeConfig
 
     from agents.configs import TrainConfig
+    from agents.ladder import Rung
 
 Floats = NDArray[np.float64]
 Rotation = Callable[[float], Floats]
@@ -134,3 +136,30 @@ def checkpoint(tmp_path: Path, trained: dict[str, tuple[BaseAlgorithm, VecNormal
     path = tmp_path / "checkpoints" / "step-000000000128"
     save_model(path, *trained["ppo"], SAVED["ppo"], True, "python train.py")
     return path
+
+
+@pytest.fixture
+def rollout(monkeypatch: pytest.MonkeyPatch) -> Told:
+    """Let a ladder's episodes end as told instead of running them; its pictures, which take time, are empty."""
+    from climbs import Told
+
+    from agents import ladder_run, sharing  # which import torch
+
+    instead = Told()
+    monkeypatch.setattr(sharing, "run", instead)
+    monkeypatch.setattr(ladder_run, "draw", lambda _: None)
+    monkeypatch.setattr(ladder_run, "png", lambda _: b"")
+    return instead
+
+
+@pytest.fixture
+def climbed(rollout: Told) -> Climbed:
+    """Climb down a ladder whose episodes end as told."""
+    from agents.catalogue import controller  # which imports torch
+    from agents.ladder import Ladder, climb
+
+    def climb_down(outcomes: Outcomes | None = None, name: str = "tuned", **setting: Any) -> list[Rung]:
+        rollout.outcomes = outcomes or {}
+        return climb(controller(name), Ladder(**setting))
+
+    return climb_down
