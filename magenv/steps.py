@@ -197,7 +197,7 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
 @kernel
 def begin_one(s: State) -> None:
     """Begin the only episode."""
-    begin_episodes(0, 1, s.every, s, s.observation)
+    begin_episodes(*_ONLY, s.every, s, s.observation)
 
 
 @kernel
@@ -308,14 +308,14 @@ def one_kernel(
         fit = clip(s.action[0])
         if fit:
             if mode == "home":
-                _home(0, 1, s.every, s.action, s)
+                _home(*_ONLY, s.every, s.action, s)
             elif mode == "pose":
-                _pose(0, 1, s.every, s.action, s)
+                _pose(*_ONLY, s.every, s.action, s)
             elif mode == "step":
-                _step(0, 1, s.every, s.action, s)
+                _step(*_ONLY, s.every, s.action, s)
             else:
                 _wrench(*_ONLY, s.every, s.action, s)
-            _hold(0, 1, s.every, s, s.observation, *shape)
+            _hold(*_ONLY, s.every, s, s.observation, *shape)
         paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
         return (
             fit,
