@@ -59,8 +59,8 @@ _ASTRAY = 1e-3
 """From which difference on, in metres and of unit vectors, EPMs that travel are not where they were believed to be."""
 
 CONVERGED, SOUGHT, UNSOLVED, FALLBACK = range(4)
-"""How a command was come by: from the last plan; from a search; from a search without convergence, or where EPMs travel
-one that leaves great errors; none found, the last safe command held."""
+"""How a command was come by: from the last plan, or where EPMs travel from any that meets the reference; from a search;
+by one that did not converge, or where EPMs travel that leaves great errors; none found, the last safe command held."""
 _OUTCOMES = np.array([SOLVED, SOLVED, NOT_CONVERGED, FELL_BACK])
 
 
@@ -108,7 +108,8 @@ class Predictive:
     n_epm : int
         Number of EPMs.
     control_hz : float
-        Control rate.
+        Control rate. Where EPMs travel each command is planned from rest to rest: with periods too short to get far, at
+        100 Hz and more, they crawl.
     plant : str
         Of whose kind the nominal plant is: how EPMs move, how exact measurements are, nominal masses and drags.
     name : str
@@ -144,8 +145,12 @@ class Predictive:
         self._home = home_epms(n_epm)
         self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
+        late = self._plant.latency_s
         require(
-            self._lag <= self._substeps, "control_hz", f"at most {1 / max(self._plant.latency_s, 1e-9):g}", control_hz
+            self._lag <= self._substeps,
+            "control_hz",
+            f"at most {1 / max(late, 1e-9):g}, where commands act {late:g} s late",
+            control_hz,
         )
         weights = _per_coordinate(1 / POSITION_M, 1 / HEADING_RAD)
         self._weights = np.concatenate([weights, SETTLING_S * weights])
@@ -179,8 +184,11 @@ class Predictive:
         n = len(batch)
         if state is None:
             state = PredictiveState([None] * n, np.zeros(n, np.int64))
+        require(len(state.rows) == n, "state", f"one of {n} episodes, as many as observations", len(state.rows))
+        if episode_start is not None:
+            require(np.shape(episode_start) == (n,), "episode_start", f"of shape ({n},)", np.shape(episode_start))
         actions = np.empty((n, POSE_SIZE * self._system.n_epm), np.float32)
-        epms = np.concatenate([parts.epm_positions, parts.epm_directions], axis=-1)
+        epms = self._told(np.concatenate([parts.epm_positions, parts.epm_directions], axis=-1))
         for i, rng in enumerate(self._rngs.of(n)):
             memory = None if episode_start is not None and episode_start[i] else state.rows[i]
             measured = parts.robots[i].reshape(-1)
@@ -197,6 +205,14 @@ class Predictive:
             memory.paths = np.concatenate([memory.paths[self._substeps :], path])
             memory.before, memory.commands = command, np.concatenate([memory.commands[1:], memory.commands[-1:]])
         return actions.reshape(*np.shape(observation)[:-1], -1), state
+
+    def _told(self, epms: Floats) -> Floats:
+        """Return the EPMs (n, N, 6) with NaN where they cannot be: no unit moment, or out of the bounds of radii."""
+        radii, sizes = np.linalg.norm(epms[..., :3], axis=-1), np.linalg.norm(epms[..., 3:], axis=-1)
+        low, high = self._system.r_min_m - _ASTRAY, self._system.r_max_m + _ASTRAY
+        sound = (low < radii) & (radii < high) & (np.abs(sizes - 1.0) < _ASTRAY)
+        told: Floats = np.where(sound[..., None], epms, np.nan)
+        return told
 
     def _begin(self, measured: Floats, epms: Floats) -> Memory:
         """Return the memory of an episode that begins, at rest."""
@@ -218,8 +234,8 @@ class Predictive:
         if not np.abs(memory.covariance[:COORDINATES]).max() < _LOST:  # NaN as well
             fresh = self._begin(measured, epms)
             memory.known, memory.covariance = fresh.known, fresh.covariance
-            return
-        correct(measured, self._noise, memory.known, memory.covariance)
+        elif np.isfinite(measured).all():
+            correct(measured, self._noise, memory.known, memory.covariance)
 
     def _see(self, memory: Memory, epms: Floats) -> None:
         """Mend what is believed of the EPMs' motion by where they are seen (N, 6), at the end of the last hold."""
@@ -230,7 +246,8 @@ class Predictive:
             if self._lag == 0:
                 memory.paths[self._substeps :] = epms  # what was commanded, as it was carried out
             return
-        astray = epms - memory.paths[now - 1]
+        around = memory.paths[now - 1 : now + 1]  # the middles of the substeps before and after; none after the last
+        astray = epms - around.mean(axis=0)
         if np.abs(astray).max() < _ASTRAY:
             return
         # They are not as fast as believed: what lacks now came evenly, and will lack.

@@ -56,7 +56,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Starting state
     On the reference, at rest, with an offset of 1 mm and 3 degrees standard deviation; EPMs at home, or where commands
-    act late, at poses that hold nominal robots.
+    act late or EPMs accelerate, at poses that hold nominal robots.
 
     ## Episode end
     *Terminated* where control is lost: a robot over 30 mm from its reference, bodies touching, or the wall reached

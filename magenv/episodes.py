@@ -6,6 +6,7 @@ generator before the first action, whatever the controller does.
 
 from __future__ import annotations
 
+import math
 import reprlib
 from dataclasses import dataclass
 from typing import Any
@@ -178,8 +179,12 @@ class Episodes:
         )
 
     def _held_epms(self, n: int) -> Floats:
-        """Return room for EPMs that hold the robots at the start, filled where all rows start alike; none at home."""
-        if self.plant.latency_s == 0.0:
+        """Return room for EPMs that hold the robots at the start, filled where all rows start alike; none at home.
+
+        Home holds nothing: robots there are lost before commands that act late, or EPMs that accelerate, could help.
+        """
+        plant = self.plant
+        if plant.latency_s == 0.0 and math.isinf(min(plant.epm_acceleration_mps2, plant.epm_turn_acceleration_radps2)):
             return np.zeros((0, self.settings.n_epm, EPM_SIZE))
         trajectory = named_trajectory(self.settings.scenario)
         if trajectory is None:

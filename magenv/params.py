@@ -336,7 +336,12 @@ def _changes(text: str, changes: str) -> dict[str, Any]:
     known, found = {f.name: f.type for f in fields(Plant) if f.type in ("float", "bool")}, dict[str, Any]()
     for change in changes.split(","):
         name, _, value = change.partition("=")
-        require(name in known and name not in found, "plant", "changed once in any of " + ", ".join(known), text)
+        require(
+            name in known and name not in found,
+            "plant",
+            "one with parameters out of " + ", ".join(known) + ", each once",
+            text,
+        )
         if known[name] == "bool":
             require(value in ("true", "false"), "plant", f"changed by true or false in {name}", text)
             found[name] = value == "true"

@@ -65,11 +65,12 @@ def _cross(u: Vector, v: Vector) -> Vector:
 def way_round(u: Vector, v: Vector) -> tuple[float, Vector]:
     """Return the angle (rad) from unit vector u to v, and the unit vector at right angles to u towards v.
 
-    Where v is opposite, any: one that is horizontal, or in the plane of u and the x axis where u is upright.
+    Where v is opposite or u itself, any: one that is horizontal, or in the plane of u and the x axis where u is
+    upright.
     """
     axis = _cross(u, v)
     sine, cosine = norm(*axis), dot3(*u, *v)
-    if (sine < _OPPOSITE) & (cosine < 0.0):
+    if (sine < _OPPOSITE) & (cosine < 0.0) | (sine == 0.0):
         axis = (0.0, 1.0, 0.0) if abs(u[2]) > _UPRIGHT else (0.0, 0.0, 1.0)
     return arctan2(sine, cosine), unit(*_cross(axis, u))
 

@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Rotation = Callable[[float], Floats]
 
-pytest.register_assert_rewrite("lane", "messages", "planned", "rollouts", "tiny_runs")  # so that they tell values
+pytest.register_assert_rewrite(
+    "lane", "messages", "planned", "rollouts", "tiny_runs", "walks"
+)  # so that they tell values
 
 
 @pytest.fixture

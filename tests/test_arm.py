@@ -14,6 +14,7 @@ from rollouts import MakeEnv
 
 from agents.predictive import Predictive
 from agents.rollout import run
+from magenv.actions import pose_to_action
 from magenv.env import TwoRobots
 from magenv.episodes import Episodes, Settings
 from magenv.forecast import Course
@@ -217,6 +218,17 @@ def test_a_batch_equals_single_episodes() -> None:
     assert first[2].tobytes() == single.tobytes()
     action = np.full((5, 10), 0.01, np.float32)
     assert envs.step(action)[0][2].tobytes() == one.step(action[2])[0].tobytes()
+
+
+@pytest.mark.parametrize("plant", ["arm", "arm:latency_s=0", "paper:epm_acceleration_mps2=5"])
+def test_episodes_begin_where_the_epms_hold_the_robots(make_env: MakeEnv, plant: str) -> None:
+    """Commands that act late, or EPMs that accelerate, could not hold in time what home lets go."""
+    env = make_env(scenario="approach-60", plant=plant, action="pose", control_hz=10.0)
+    held, info = make_env(scenario="approach-60", plant="arm").reset(seed=0)[1], env.reset(seed=0)[1]
+    np.testing.assert_array_equal(info["epm_pose"], held["epm_pose"])
+    for _ in range(4):  # 0.4 s; from home they are lost after 0.2
+        *_, terminated, _, _ = env.step(pose_to_action(held["epm_pose"], System()))
+        assert not terminated
 
 
 def test_episodes_do_not_depend_on_the_kind_of_plant(make_env: MakeEnv) -> None:

@@ -54,6 +54,19 @@ def test_derivatives_of_a_way_are_those_by_its_ends(rng: np.random.Generator, pl
             np.testing.assert_array_equal(up[:, 1 - k], down[:, 1 - k])
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_derivatives_where_epms_stay(axis: int) -> None:
+    """Exactly: along an axis, no way tells a direction. At the end, where they are is what is commanded."""
+    epms = np.zeros((2, 6))
+    epms[0, [axis, 3 + axis]] = -0.2, 1.0
+    epms[1, [(axis + 1) % 3, 3 + axis]] = 0.3, -1.0
+    motion, bases = moved(arms_of("arm", 2, 40), epms, epms, 40), bases_of(epms)
+    np.testing.assert_allclose(motion.path, np.repeat(epms[None], 40, axis=0), atol=1e-15)
+    np.testing.assert_allclose(motion.by[-1, 1], bases, atol=1e-12)
+    np.testing.assert_allclose(motion.by[-1, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(motion.by[0, 0] + motion.by[0, 1], bases, atol=1e-12)
+
+
 def test_what_jumps_is_where_it_is_commanded(rng: np.random.Generator) -> None:
     before, command = magnets(rng), magnets(rng)
     motion = Course.of(2, 10, False)

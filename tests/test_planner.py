@@ -10,6 +10,7 @@ import pytest
 from foreseen import CERTAIN, PAPER, UNMOVED, WEIGHTS, Floats, at_home, end_of, goal_of, held, on_the_way
 from lane import magnets
 
+from agents import planner as planner_module
 from agents.planner import ENOUGH, TROUBLE, Planner, Problem
 from magenv.manoeuvre import allow
 from magenv.params import PLANTS, System
@@ -104,6 +105,25 @@ def test_the_way_ahead_is_the_shorter_one_round() -> None:
     expected = problem.goal.references[0, 0, :6] - problem.state[:6]
     expected[[2, 5]] = [2 * math.pi - 6.0, 6.0 - 2 * math.pi]
     np.testing.assert_allclose(problem.ahead(), expected, atol=1e-12)
+
+
+def test_searches_begin_where_errors_grow_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robots 20 mm apart at 2 Hz: errors grow less by commands sought with a doubt in mind than by those without."""
+    state, ahead = on_the_way(0.02, 50.0), on_the_way(0.02, 50.5)
+    planner, grown = Planner(System(), PAPER, 0.5, 100, 1), []
+    problem = Problem(state, UNMOVED, CERTAIN, goal_of(ahead[None], (100,), WEIGHTS * SETTLING), at_home(state))
+    for doubt in (planner_module.DOUBT, CERTAIN):
+        monkeypatch.setattr(planner_module, "DOUBT", doubt)
+        rng, factors = np.random.default_rng(0), []
+        for _ in range(20):
+            cost, command = planner._led_up_to(problem, planner._held(problem, rng))
+            if cost < ENOUGH:
+                ends = [end_of(planner.model, state + e, UNMOVED, held(command[0], 100)) for e in 1e-7 * np.eye(12)[:6]]
+                away = np.array(ends) - end_of(planner.model, state, UNMOVED, held(command[0], 100))
+                factors.append(np.linalg.norm(away[:, [0, 1, 3, 4]]) / 1e-7)
+        assert len(factors) > 5
+        grown.append(np.median(factors))
+    assert grown[0] < 0.8 * grown[1]
 
 
 @pytest.mark.parametrize("plant", ["moving", "arm", "arm-reach"])

@@ -147,5 +147,9 @@ def test_a_trim_stays_near_the_last(rng: np.random.Generator) -> None:
 
 
 def test_where_nothing_can_be_foreseen_the_trim_stays(rng: np.random.Generator) -> None:
+    """Within its bounds."""
     trim, last = trim_of(), magnets(rng)
     np.testing.assert_array_equal(trim.follow(np.full(STATE, np.nan), UNMOVED, last, rng), last)
+    cost, allowed = trim.improve(np.full(STATE, np.nan), UNMOVED, last, last * [0.1, 0.1, 0.1, 1, 1, 1])
+    assert cost == math.inf
+    assert np.linalg.norm(allowed[:, :3], axis=1).min() > System().r_min_m - 1e-9
