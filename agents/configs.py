@@ -113,7 +113,7 @@ class TrainConfig:
     algo: Algo = "ppo"
     """Learning algorithm."""
     scenario: str = "random"
-    """Trajectories trained on: random (the seeded family), approach-<s>, approach-<s>-anti."""
+    """Trajectories trained on: random (the seeded family), or a shape as in evaluate.py."""
     plant: str = "paper"
     """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2

@@ -16,6 +16,7 @@ from magenv.arithmetic import fma
 from magenv.kernels import kernel, law
 from magenv.params import require
 from magenv.random_knots import RANDOM_TURN_MAX_RADPS, try_knots
+from magenv.shape_knots import SHAPES, shape_knots
 from magenv.streams import Keys
 
 Floats = NDArray[np.float64]
@@ -26,13 +27,11 @@ SEGMENTS = 32
 _KNOTS = SEGMENTS + 1
 _AXES = 6  # x, y, heading of both robots
 DURATION_S = 100.0
-HALF_LENGTH_M = 0.060
-"""The approach scenarios run from -60 mm to 60 mm in x."""
-HALF_WIDTH_M = 0.050
-"""Distance of each robot from the x axis at both ends of an approach scenario."""
 
-SCENARIO_HELP = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
-_APPROACH = re.compile(r"approach-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)
+SCENARIO_HELP = (
+    f"random, {', '.join(f'{shape}-<s>' for shape in SHAPES)} or approach-<s>-anti with s from 12 to 100 (mm)"
+)
+_NAMED = re.compile(rf"({'|'.join(SHAPES)})-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,29 +154,15 @@ def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
             c[0], c[1], c[2], c[3] = y[k, j], s0, 3.0 * rise - 2.0 * s0 - s1, s0 + s1 - 2.0 * rise
 
 
-def _along_path(positions: Floats, velocities: Floats, flip_second: bool) -> Floats:
-    """Return knots (33, 2, 3) with headings along the velocities, robot 2's turned by pi where asked."""
-    headings = np.unwrap(np.arctan2(velocities[..., 1], velocities[..., 0]), axis=0)
-    if flip_second:
-        headings[:, 1] += math.pi
-    return np.concatenate([positions, headings[..., None]], axis=-1)
-
-
 def approach(separation_m: float, anti: bool = False) -> Trajectory:
-    """Return the scenario in which the robots come to ``separation_m`` of each other side by side and part again.
+    """Return the paper's kind of scenario: see ``shape_knots.shape_knots``."""
+    return shaped("approach", separation_m, anti)
 
-    Robot 1 runs along x at constant speed, its y a parabola from -50 mm to half the separation, robot 2 mirrored;
-    headings along the path, robot 2's turned by pi where ``anti``.
-    """
+
+def shaped(shape: str, separation_m: float, anti: bool = False) -> Trajectory:
+    """Return a named shape on which the robots come to ``separation_m`` of each other: see ``shape_knots``."""
     require(0.012 <= separation_m <= 0.100, "separation_m", "from 0.012 to 0.100", separation_m)
-    u = np.linspace(-1.0, 1.0, SEGMENTS + 1)
-    depth = HALF_WIDTH_M - separation_m / 2
-    y = separation_m / 2 + depth * u**2
-    positions = np.stack([np.stack([HALF_LENGTH_M * u, side * y], axis=-1) for side in (-1.0, 1.0)], axis=1)
-    velocities = np.stack(
-        [np.stack([np.full_like(u, HALF_LENGTH_M), side * 2 * depth * u], axis=-1) for side in (-1.0, 1.0)], axis=1
-    )
-    return Trajectory.through(DURATION_S, _along_path(positions, velocities, anti))
+    return Trajectory.through(DURATION_S, shape_knots(shape, separation_m, anti, SEGMENTS))
 
 
 def named_trajectory(scenario: str) -> Trajectory | None:
@@ -190,10 +175,11 @@ def named_trajectory(scenario: str) -> Trajectory | None:
     """
     if scenario == "random":
         return None
-    match = _APPROACH.fullmatch(scenario) if isinstance(scenario, str) else None
-    require(match is not None and 12 <= float(match[1]) <= 100, "scenario", SCENARIO_HELP, scenario)
+    match = _NAMED.fullmatch(scenario) if isinstance(scenario, str) else None
+    known = match is not None and 12 <= float(match[2]) <= 100 and (match[1] == SHAPES[0] or match[3] is None)
+    require(known, "scenario", SCENARIO_HELP, scenario)
     assert match is not None
-    return approach(float(match[1]) / 1000, anti=match[2] is not None)
+    return shaped(match[1], float(match[2]) / 1000, anti=match[3] is not None)
 
 
 @kernel

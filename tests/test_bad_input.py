@@ -25,7 +25,10 @@ from magenv.trajectories import Trajectory, approach
 from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
 
-SCENARIOS = "random, approach-<s> or approach-<s>-anti with s from 12 to 100 (mm)"
+SCENARIOS = (
+    "random, approach-<s>, crossing-<s>, meeting-<s>, eight-<s>, still-<s> or approach-<s>-anti "
+    "with s from 12 to 100 (mm)"
+)
 CONTROL_HZ = "a number from 0.01 to 1000.0"
 CHANGES = ", ".join(f.name for f in dataclasses.fields(Plant) if f.name != "body")
 
@@ -36,6 +39,8 @@ ARGUMENTS: list[tuple[dict[str, Any], str, str]] = [
     ({"scenario": "approach-30-ante"}, "scenario", SCENARIOS),
     ({"scenario": "approach-30\n"}, "scenario", SCENARIOS),
     ({"scenario": "approach-nan"}, "scenario", SCENARIOS),
+    ({"scenario": "meeting-30-anti"}, "scenario", SCENARIOS),
+    ({"scenario": "eights-30"}, "scenario", SCENARIOS),
     ({"scenario": ""}, "scenario", SCENARIOS),
     ({"scenario": None}, "scenario", SCENARIOS),
     ({"scenario": 30}, "scenario", SCENARIOS),

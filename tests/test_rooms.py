@@ -53,6 +53,7 @@ ORDER = [
     "crosstalk.__main__",
     "streams",
     "random_knots",
+    "shape_knots",
     "trajectories",
     "lanes",
     "magnets",

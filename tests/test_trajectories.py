@@ -55,6 +55,51 @@ def test_robots_meet_parallel() -> None:
     np.testing.assert_allclose(middle, [[0, -0.015, 0], [0, 0.015, 0]], atol=1e-12)
 
 
+SHAPES_AT = [
+    f"{shape}-{separation}" for shape in ("crossing", "meeting", "eight", "still") for separation in (16, 30, 60)
+]
+
+
+@pytest.mark.parametrize("scenario", SHAPES_AT)
+def test_shapes_come_to_their_separation_and_clear_the_wall(scenario: str) -> None:
+    path = sampled(draw(scenario, np.random.default_rng(0)))
+    distance = np.linalg.norm(path[:, 1, :2] - path[:, 0, :2], axis=-1)
+    assert distance.min() == pytest.approx(float(scenario.split("-")[1]) / 1000, abs=2e-5)
+    assert np.linalg.norm(path[..., :2], axis=-1).max() < 0.094
+    assert np.abs(np.diff(path[..., 2], axis=0)).max() / (TIMES[1] - TIMES[0]) < 0.15  # rad/s
+
+
+@pytest.mark.parametrize("scenario", SHAPES_AT)
+def test_shapes_head_along_their_paths(scenario: str) -> None:
+    path = sampled(draw(scenario, np.random.default_rng(0)))
+    step, middle = np.diff(path[..., :2], axis=0), 0.5 * (path[1:, :, 2] + path[:-1, :, 2])
+    moves = np.linalg.norm(step, axis=-1) > 0
+    assert moves.all(axis=0).tolist() == [True, not scenario.startswith("still")]
+    off = np.abs(np.angle(np.exp(1j * (np.arctan2(step[..., 1], step[..., 0]) - middle))))
+    assert off[moves].max() < math.radians(0.5)
+
+
+def test_shapes_are_what_they_are_called() -> None:
+    def at(scenario: str, time: float) -> Floats:
+        return draw(scenario, np.random.default_rng(0)).at(time)
+
+    np.testing.assert_allclose(at("meeting-30", 50.0), [[0, -0.015, 0], [0, 0.015, -math.pi]], atol=1e-12)
+    np.testing.assert_allclose(at("meeting-30", 0.0)[:, :2], [[-0.060, -0.050], [0.060, 0.050]], atol=1e-12)
+    for time in (0.0, 50.0, 100.0):
+        np.testing.assert_allclose(at("still-30", time)[1], [0, 0.015, 0], atol=1e-12)
+    np.testing.assert_allclose(at("still-30", 0.0)[0], approach(0.030).at(0.0)[0], atol=1e-12)
+    crossing = sampled(draw("crossing-30", np.random.default_rng(0)))
+    np.testing.assert_allclose(crossing[:, 0, 1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(crossing[:, 1, 0], 0.0, atol=1e-12)
+    assert (crossing[0, 0, 0], crossing[0, 1, 1]) < (0, 0) < (crossing[-1, 0, 0], crossing[-1, 1, 1])
+    eight = sampled(draw("eight-30", np.random.default_rng(0)))
+    np.testing.assert_allclose(eight[0], eight[-1], atol=1e-12)
+    sides = np.sign(eight[[125, 375, 625, 875], 0, 1] + 0.015)
+    np.testing.assert_array_equal(sides, [1, -1, 1, -1])
+    np.testing.assert_allclose(eight[500, 0, :2], [0, -0.015], atol=1e-12)
+    np.testing.assert_allclose(eight[:, 1] - eight[:, 0], np.broadcast_to([0, 0.030, 0], (1001, 3)), atol=1e-12)
+
+
 def test_reference_is_held_outside_its_time() -> None:
     trajectory = approach(0.030)
     np.testing.assert_array_equal(trajectory.at(-5.0), trajectory.at(0.0))
