@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 SHAPES = ("approach", "crossing", "meeting", "eight", "still")
-HALF_LENGTH_M = 0.060
+_HALF_LENGTH_M = 0.060
 """Approaches run from -60 mm to 60 mm in x."""
-HALF_WIDTH_M = 0.050
+_HALF_WIDTH_M = 0.050
 """Distance of each robot from the x axis at both ends of an approach."""
 _CROSSING_M = 0.045
 """Half the way of each robot in ``crossing``."""
@@ -22,9 +22,9 @@ _EIGHT_M = 0.050, 0.014
 
 def _parabola(u: Floats, separation_m: float, side: float, way: float = 1.0) -> tuple[Floats, Floats]:
     """Return places and velocities (k, 2) along x at constant speed, y a parabola down to half the separation."""
-    depth = HALF_WIDTH_M - separation_m / 2
-    places = np.stack([way * HALF_LENGTH_M * u, side * (separation_m / 2 + depth * u**2)], axis=-1)
-    return places, np.stack([np.full_like(u, way * HALF_LENGTH_M), side * 2 * depth * u], axis=-1)
+    depth = _HALF_WIDTH_M - separation_m / 2
+    places = np.stack([way * _HALF_LENGTH_M * u, side * (separation_m / 2 + depth * u**2)], axis=-1)
+    return places, np.stack([np.full_like(u, way * _HALF_LENGTH_M), side * 2 * depth * u], axis=-1)
 
 
 def _eight(u: Floats, centre_y: float) -> tuple[Floats, Floats]:
@@ -47,15 +47,16 @@ def shape_knots(shape: str, separation_m: float, anti: bool, segments: int) -> F
     In ``anti`` robot 2 heads against its way.
     """
     u = np.linspace(-1.0, 1.0, segments + 1)
+    rest, going = np.zeros_like(u), np.ones_like(u)
     one, two = _parabola(u, separation_m, -1.0), _parabola(u, separation_m, 1.0)
     if shape == "meeting":
         two = _parabola(u, separation_m, 1.0, way=-1.0)
     elif shape == "still":
-        two = np.tile([0.0, separation_m / 2], (len(u), 1)), np.tile([1.0, 0.0], (len(u), 1))
+        two = np.stack([rest, rest + separation_m / 2], axis=-1), np.stack([going, rest], axis=-1)
     elif shape == "crossing":
-        early, way = separation_m / math.sqrt(2.0), _CROSSING_M * u[:, None]
-        along, across = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-        one, two = ((way + early) * along, along + 0 * way), ((way - early) * across, across + 0 * way)
+        early, way = separation_m / math.sqrt(2.0), _CROSSING_M * u
+        one = np.stack([way + early, rest], axis=-1), np.stack([going, rest], axis=-1)
+        two = np.stack([rest, way - early], axis=-1), np.stack([rest, going], axis=-1)
     elif shape == "eight":
         one, two = _eight(u, -separation_m / 2), _eight(u, separation_m / 2)
     positions, velocities = (np.stack([a, b], axis=1) for a, b in zip(one, two, strict=True))

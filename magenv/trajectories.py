@@ -154,13 +154,15 @@ def spline_through(knots: Floats, slopes: Floats, coefficients: Floats) -> None:
             c[0], c[1], c[2], c[3] = y[k, j], s0, 3.0 * rise - 2.0 * s0 - s1, s0 + s1 - 2.0 * rise
 
 
-def approach(separation_m: float, anti: bool = False) -> Trajectory:
-    """Return the paper's kind of scenario: see ``shape_knots.shape_knots``."""
-    return shaped("approach", separation_m, anti)
-
-
 def shaped(shape: str, separation_m: float, anti: bool = False) -> Trajectory:
-    """Return a named shape on which the robots come to ``separation_m`` of each other: see ``shape_knots``."""
+    """Return a named shape on which the robots come to ``separation_m`` of each other: see ``shape_knots``.
+
+    Raises
+    ------
+    ValueError
+        If there is no such shape, or the separation is not from 12 to 100 mm.
+    """
+    require(shape in SHAPES, "shape", f"one of {', '.join(SHAPES)}", shape)
     require(0.012 <= separation_m <= 0.100, "separation_m", "from 0.012 to 0.100", separation_m)
     return Trajectory.through(DURATION_S, shape_knots(shape, separation_m, anti, SEGMENTS))
 

@@ -12,7 +12,7 @@ from magenv.lanes import CONSTANTS, CONSTANTS_SIZE
 from magenv.local import local_basis, shift
 from magenv.params import PLANTS, System
 from magenv.sensitivity import Model, believe
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 
 Floats = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def end_of(model: Model, state: Floats, pushing: Floats, motion: Course) -> Floa
 
 def on_the_way(scenario_m: float, time_s: float) -> Floats:
     """State (12,) of robots that follow an approach to so many metres."""
-    trajectory, h = approach(scenario_m), 1e-3
+    trajectory, h = shaped("approach", scenario_m), 1e-3
     rates = (trajectory.at(time_s + h) - trajectory.at(time_s - h)) / (2 * h)
     return np.concatenate([trajectory.at(time_s).ravel(), rates.ravel()])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.records import Record
 from magenv.poses import home_pose
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 
 STEPS = 40
 
@@ -19,7 +19,7 @@ def a_record(held_steps: int = STEPS, error_m: float = 1e-3, **changes: Any) -> 
 
     Robot 1 is ``error_m`` beside its reference in x, robot 2 on it; both are turned by 2 ``error_m`` (rad per m).
     """
-    trajectory = approach(0.03)
+    trajectory = shaped("approach", 0.03)
     reference = np.stack([trajectory.at(time) for time in np.linspace(30.0, 70.0, STEPS + 1)])
     robots = reference[: held_steps + 1].copy()
     robots[:, 0, 0] += error_m

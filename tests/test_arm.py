@@ -20,7 +20,7 @@ from magenv.episodes import Episodes, Settings
 from magenv.forecast import Course
 from magenv.manoeuvre import Arms, allow, move
 from magenv.params import PLANTS, Plant, System, TaskParams
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.ways import longest_way, ramp, share_gone
 from magenv.world import World
@@ -37,7 +37,7 @@ FREE = TaskParams(control_hz=1.0 / H, loss_distance_m=10.0)
 
 def world_of(starts: Floats, plant: Plant = PROMPT, task: TaskParams = FREE) -> World:
     """A world whose EPMs stand at ``starts`` (n, N, 6), the robots at rest."""
-    world, trajectory = World(len(starts), System(n_epm=starts.shape[1]), plant, task), approach(0.060)
+    world, trajectory = World(len(starts), System(n_epm=starts.shape[1]), plant, task), shaped("approach", 0.060)
     robots = np.zeros((2, 6))
     robots[:, :3] = trajectory.at(0.0)
     for row, epms in enumerate(starts):

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from rollouts import AUTORESETS, MakeEnv, N, Record, assert_same_bits, assert_same_info, info_of, vector
 
 from magenv.steps import begin_episodes
-from magenv.trajectories import approach, draw
+from magenv.trajectories import draw, shaped
 from magenv.vector_env import TwoRobotsVector
 
 
@@ -127,7 +127,7 @@ def test_rows_out_of_step_are_told_the_references_of_their_own_times() -> None:
     _, _, _, _, info = env.step(still)
     assert info["time_s"][0] > info["time_s"][1]
     for time, reference in zip(info["time_s"], info["reference"], strict=True):
-        np.testing.assert_allclose(reference, approach(0.060).at(time), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(reference, shaped("approach", 0.060).at(time), rtol=0, atol=1e-15)
 
 
 def test_a_mask_need_not_lie_in_one_piece() -> None:

@@ -21,7 +21,7 @@ from magenv.home import home_epms
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.reach import Shell
 from magenv.starts import holding_epms
-from magenv.trajectories import Trajectory, approach
+from magenv.trajectories import Trajectory, shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
 
@@ -248,7 +248,7 @@ def a_world(**changes: Any) -> World:
 
 
 def test_a_trajectory_that_leaves_the_workspace() -> None:
-    far, meeting = approach(0.06), approach(0.06)
+    far, meeting = shaped("approach", 0.06), shaped("approach", 0.06)
     far.coefficients[..., 0, :] *= 1.6
     meeting.coefficients[:, :, 1] = 0.0
     for trajectory in (far, meeting):
@@ -273,7 +273,7 @@ def test_a_start_that_cannot_be(robots: Any, epms: Any, message: str) -> None:
     states = np.pad(np.array(robots, dtype=float), ((0, 0), (0, 3)))
     world = a_world()
     with pytest.raises(ValueError, match="^Input " + message):
-        world.start(0, approach(0.06), states, home_epms(2) if epms is None else epms)
+        world.start(0, shaped("approach", 0.06), states, home_epms(2) if epms is None else epms)
     assert not world.robots.any(), "nothing was put anywhere"
 
 

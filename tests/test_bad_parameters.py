@@ -19,7 +19,7 @@ from magenv.env import TwoRobots
 from magenv.params import Body, Magnet, Plant, System, TaskParams
 from magenv.poses import from_cartesian, home_pose, project, to_cartesian
 from magenv.task import unpack
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.wrench import robot_wrench, wrench_jacobian
 
 POSITIVE = "a positive, finite number"
@@ -219,7 +219,12 @@ def test_action_mode() -> None:
 @pytest.mark.parametrize("separation", [0.0119, 0.1001, -0.03, math.nan])
 def test_separation(separation: float) -> None:
     with pytest.raises(ValueError, match=told("separation_m", "from 0.012 to 0.100", separation)):
-        approach(separation)
+        shaped("approach", separation)
+
+
+def test_shape() -> None:
+    with pytest.raises(ValueError, match=told("shape", "one of approach, crossing, meeting, eight, still", "circle")):
+        shaped("circle", 0.03)
 
 
 def test_observation_that_cannot_be_unpacked(make_env: MakeEnv) -> None:

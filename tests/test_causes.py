@@ -19,7 +19,7 @@ from magenv.params import PLANTS, System, TaskParams
 from magenv.poses import from_cartesian, home_pose, to_cartesian
 from magenv.reach import Shell, shoulder
 from magenv.stiffness import planar_stiffness
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.world import World
 from magenv.wrench import planar_moments
 
@@ -148,7 +148,7 @@ def test_growth_is_that_of_the_plant() -> None:
     for row in range(2):
         state = np.concatenate([record.robots[hold], np.zeros((2, 3))], axis=1)
         state += row * little * fastest.reshape(2, 2, 3).transpose(1, 0, 2).reshape(2, 6)
-        world.start(row, approach(0.030), state, epms)
+        world.start(row, shaped("approach", 0.030), state, epms)
     world.step_count[:] = hold
     world.step(np.tile(epms, (2, 1, 1)), np.ones(2, np.bool_))
     apart = (world.robots[1] - world.robots[0]).reshape(2, 2, 3).transpose(1, 0, 2).reshape(12)

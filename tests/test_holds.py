@@ -22,7 +22,7 @@ from magenv.crosstalk import (
 from magenv.params import PLANTS, Body, System, TaskParams
 from magenv.poses import to_cartesian
 from magenv.stiffness import planar_stiffness
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.world import World
 from magenv.wrench import planar_moments, robot_wrench
 
@@ -127,7 +127,7 @@ def test_growth_is_that_of_the_plant() -> None:
     robots[:, 0], robots[:, 2] = pair.positions[:, 0], math.radians(90.0)
     rng = np.random.default_rng(0)
     robots[:, :3] += rng.normal(size=(2, 3)) * [1e-9, 1e-9, 1e-8]
-    world.start(0, approach(0.06), robots, epms[0])
+    world.start(0, shaped("approach", 0.06), robots, epms[0])
     still, sizes = robots[:, :3].copy(), []
     still[:, 0], still[:, 1], still[:, 2] = pair.positions[:, 0], 0.0, math.radians(90.0)
     for _ in range(int(12.0 / rate.real / 0.05)):
@@ -174,7 +174,7 @@ def test_a_stable_hold_needs_no_controller() -> None:
     robots[:, 0], robots[:, 2] = pair.positions[:, 0], math.radians(90.0)
     still = robots.copy()
     robots[0, :3] += [3e-4, -4e-4, math.radians(3.0)]
-    world.start(0, approach(0.06), robots, epms)
+    world.start(0, shaped("approach", 0.06), robots, epms)
     for _ in range(20):  # 10 s
         world.step(epms[None], np.ones(1, np.bool_))
     assert np.abs(world.robots[0] - still).max() < 1e-6

@@ -17,7 +17,7 @@ from magenv.dynamics import Physics
 from magenv.lanes import EPMS, fields
 from magenv.params import PLANTS, Body, Magnet, System, TaskParams
 from magenv.poses import EPM_SIZE, from_cartesian
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.travel import Motion, carry, go_on, take_up
 from magenv.world import World
 from magenv.wrench import planar_moments
@@ -83,7 +83,7 @@ def test_the_plant_moves_robots_by_magpylibs_wrench(rng: np.random.Generator) ->
     """Under drag that takes the speed away within a substep there remains wrench over drag: in lanes side by side."""
     body = Body(mass_kg=1e-6, inertia_kgm2=1e-10, drag_linear_nspm=10.0, drag_rotational_nmsprad=1e-3)
     task, n = TaskParams(control_hz=200.0, loss_distance_m=10.0), 20
-    world = World(n, SYSTEM, replace(CYLINDERS, body=body), task, approach(0.06))
+    world = World(n, SYSTEM, replace(CYLINDERS, body=body), task, shaped("approach", 0.06))
     assert world.substeps == 1
     scenes = [scene(rng) for _ in range(n)]
     world.robots[:], targets = (np.array(part) for part in zip(*scenes, strict=True))

@@ -17,7 +17,7 @@ from magenv.params import PLANTS, Plant, System, plant_named
 from magenv.poses import from_cartesian, to_cartesian
 from magenv.reach import Shell, shoulder
 from magenv.starts import holding_epms
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.vector_env import TwoRobotsVector
 
 # The shell
@@ -147,7 +147,7 @@ def test_an_episode_begins_within_reach() -> None:
 
 def test_a_start_that_no_arm_can_hold_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Robots that head backwards: the first poses found are out of reach, and no others are sought."""
-    reference = approach(0.060).at(0.0) + np.array([0.0, 0.0, 3.0])
+    reference = shaped("approach", 0.060).at(0.0) + np.array([0.0, 0.0, 3.0])
     first = holding_epms(reference, System(), Shell.of(System(), PLANTS["arm"]))
     assert beyond(first[:, :3]) > 0.0
     assert beyond(holding_epms(reference, System(), SHELL)[:, :3]) <= 0.0

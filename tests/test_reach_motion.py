@@ -16,7 +16,7 @@ from magenv.manoeuvre import Arms, allow, move
 from magenv.params import System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.reach import room, shoulder, stays
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.ways import way_round
 from magenv.world import World
 
@@ -87,7 +87,7 @@ def test_a_way_that_stays_is_within_reach(rng: np.random.Generator) -> None:
 
 def travelled(system: System, draws: Floats, substeps: int) -> Floats:
     """EPMs after each substep (K, n, N, 6), from the first of the draws (G, n, N, 6) towards each of the others."""
-    world, trajectory = World(draws.shape[1], system, PLANT, FREE), approach(0.060)
+    world, trajectory = World(draws.shape[1], system, PLANT, FREE), shaped("approach", 0.060)
     robots = np.zeros((2, 6))
     robots[:, :3] = trajectory.at(0.0)
     for row, epms in enumerate(draws[0]):
@@ -147,7 +147,7 @@ def test_what_is_allowed_is_within_reach_all_the_way_as_foreseen(rng: np.random.
     system, substeps, rows, moves = System(n_epm=n_epm), 20, 20, 25
     arms, motion = Arms.of(system, PLANT, H, substeps), Course.of(n_epm, substeps, True)
     actions = Actions("pose", system, shell=SHELL)
-    world, trajectory = World(rows, system, PLANT, FREE), approach(0.060)
+    world, trajectory = World(rows, system, PLANT, FREE), shaped("approach", 0.060)
     before = np.array([within(rng, system) for _ in range(rows)])
     wished = np.array([anywhere(rng, system) for _ in range(rows)])
     robots, touched, gone = np.zeros((2, 6)), 0, 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magenv.params import PLANTS, System
 from magenv.render import RENDER_FPS, ROBOT_COLOURS, Renderer
 from magenv.scene import Scene
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.world import LOSSES
 
 pytestmark = pytest.mark.usefixtures("no_display")
@@ -24,7 +24,7 @@ MOVE_M = 0.02
 
 
 def a_scene(n_epm: int = 2, time_s: float = 50.0) -> Scene:
-    trajectory = approach(0.06)
+    trajectory = shaped("approach", 0.06)
     angle = 2 * np.pi * np.arange(n_epm) / n_epm
     return Scene(
         time_s=time_s,

@@ -19,7 +19,7 @@ from agents.records import Record, load, save
 from agents.rollout import controller_seed, run
 from magenv.params import PLANTS, System
 from magenv.task import Layout, unpack
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 
 SUBSTEP_S = 0.005
 
@@ -137,7 +137,7 @@ def test_a_lost_episode_ends_at_the_very_substep() -> None:
         assert record.loss_time_s == record.time_s[-1]
         assert record.loss_time_s == pytest.approx(0.5 * (holds - 1) + SUBSTEP_S * record.substeps[-1])
         assert len(record.time_s) == len(record.robots) == len(record.epm_pose) == holds + 1
-        target = approach(0.06).at(record.loss_time_s)
+        target = shaped("approach", 0.06).at(record.loss_time_s)
         away = np.hypot(*(record.robots[-1] - target)[:, :2].T)
         assert 0.030 < away.max() < 0.032
         assert record.position_error_end_m[-1] == pytest.approx(away.mean(), rel=1e-9)

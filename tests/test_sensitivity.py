@@ -30,7 +30,7 @@ from magenv.params import PLANTS, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.sensitivity import Model
 from magenv.stiffness import planar_kernel
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.world import World
 from magenv.wrench import planar_moments, robot_wrench
 
@@ -141,7 +141,7 @@ def test_the_models_motion_is_the_plants_bit_for_bit(rng: np.random.Generator, n
     world, state = World(1, system, PAPER, task), on_the_way(0.06, 50.0)
     epms = at_home(state, n_epm) * [2.2, 2.2, 2.2, 1.0, 1.0, 1.0]  # far away, so that the robots do not soon meet
     robots = np.concatenate([state[:6].reshape(2, 3), state[6:].reshape(2, 3)], axis=1)
-    world.start(0, approach(0.06), robots, epms)
+    world.start(0, shaped("approach", 0.06), robots, epms)
     model = Model.of(system, PAPER, task.period_s / world.substeps)
     for _ in range(3):
         epms = shifted(epms, rng.normal(0.0, 0.05, 5 * n_epm))

@@ -19,7 +19,7 @@ from magenv.env import TwoRobots
 from magenv.hold import hold_rows, hold_shape
 from magenv.params import PLANTS, System, TaskParams
 from magenv.solver import best_of, descend
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.workers import Workers
 from magenv.world import World
@@ -111,7 +111,7 @@ def test_a_generator_put_in_place_is_drawn_from() -> None:
 
 def test_one_trajectory_is_kept_once() -> None:
     """Rows of a named scenario share their reference; rows with one of their own give the same motion."""
-    system, task, trajectory = System(), TaskParams(), approach(0.05)
+    system, task, trajectory = System(), TaskParams(), shaped("approach", 0.05)
     plant = TwoRobotsVector(1)._episodes.plant
     shared, own = World(20, system, plant, task, trajectory), World(20, system, plant, task)
     assert len(shared.coefficients) == 1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magenv.params import Plant
 from magenv.random_knots import RANDOM_SEPARATION_M
-from magenv.trajectories import DURATION_S, Trajectory, approach, draw
+from magenv.trajectories import DURATION_S, Trajectory, draw, shaped
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def test_anti_turns_the_second_robot_alone(separation_mm: int) -> None:
 
 
 def test_robots_meet_parallel() -> None:
-    middle = approach(0.030).at(DURATION_S / 2)
+    middle = shaped("approach", 0.030).at(DURATION_S / 2)
     np.testing.assert_allclose(middle, [[0, -0.015, 0], [0, 0.015, 0]], atol=1e-12)
 
 
@@ -87,7 +87,7 @@ def test_shapes_are_what_they_are_called() -> None:
     np.testing.assert_allclose(at("meeting-30", 0.0)[:, :2], [[-0.060, -0.050], [0.060, 0.050]], atol=1e-12)
     for time in (0.0, 50.0, 100.0):
         np.testing.assert_allclose(at("still-30", time)[1], [0, 0.015, 0], atol=1e-12)
-    np.testing.assert_allclose(at("still-30", 0.0)[0], approach(0.030).at(0.0)[0], atol=1e-12)
+    np.testing.assert_allclose(at("still-30", 0.0)[0], shaped("approach", 0.030).at(0.0)[0], atol=1e-12)
     crossing = sampled(draw("crossing-30", np.random.default_rng(0)))
     np.testing.assert_allclose(crossing[:, 0, 1], 0.0, atol=1e-12)
     np.testing.assert_allclose(crossing[:, 1, 0], 0.0, atol=1e-12)
@@ -101,7 +101,7 @@ def test_shapes_are_what_they_are_called() -> None:
 
 
 def test_reference_is_held_outside_its_time() -> None:
-    trajectory = approach(0.030)
+    trajectory = shaped("approach", 0.030)
     np.testing.assert_array_equal(trajectory.at(-5.0), trajectory.at(0.0))
     np.testing.assert_array_equal(trajectory.at(DURATION_S + 7.0), trajectory.at(DURATION_S))
     np.testing.assert_allclose(trajectory.at(DURATION_S)[0, :2], [0.060, -0.050], atol=1e-12)
@@ -173,7 +173,7 @@ def nearest_approach(paths: Floats) -> float:
 
 
 def test_approach_is_found_by_the_measure_of_the_next_test() -> None:
-    path = sampled(approach(0.032))
+    path = sampled(shaped("approach", 0.032))
     turn = np.array([[math.cos(1.0), -math.sin(1.0)], [math.sin(1.0), math.cos(1.0)]])
     assert nearest_approach(path[..., :2] @ turn.T) < 1e-9
 

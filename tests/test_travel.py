@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.poses import from_cartesian
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
 from magenv.wrench import planar_moments, robot_wrench
@@ -30,7 +30,7 @@ FREE = TaskParams(control_hz=1.0 / H, loss_distance_m=10.0)
 
 def world_of(systems: System, starts: Floats, plant: Plant = PLANT, task: TaskParams = FREE) -> World:
     """A world whose EPMs stand at ``starts`` (n, N, 6), the robots at rest."""
-    world, trajectory = World(len(starts), systems, plant, task), approach(0.060)
+    world, trajectory = World(len(starts), systems, plant, task), shaped("approach", 0.060)
     robots = np.zeros((2, 6))
     robots[:, :3] = trajectory.at(0.0)
     for row, epms in enumerate(starts):

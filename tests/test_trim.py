@@ -17,7 +17,7 @@ from magenv.params import PLANTS, Plant, System, TaskParams
 from magenv.poses import from_cartesian
 from magenv.reach import beyond_reach
 from magenv.stiffness import growth_rates, planar_stiffness
-from magenv.trajectories import approach
+from magenv.trajectories import shaped
 from magenv.travel import Motion
 from magenv.world import World
 from magenv.wrench import planar_moments
@@ -67,7 +67,7 @@ def left_alone(epms: Floats, moved: Floats, seconds: float) -> Floats:
     world = World(1, System(n_epm=len(epms)), PAPER, TaskParams(control_hz=1.0 / seconds, loss_distance_m=10.0))
     robots = np.zeros((2, 6))
     robots[:, :3] = APART + moved
-    world.start(0, approach(SEPARATION), robots, epms)
+    world.start(0, shaped("approach", SEPARATION), robots, epms)
     world.step(epms[None], np.ones(1, np.bool_))
     return world.robots[0, :, :3] - APART
 

@@ -11,14 +11,14 @@ from lane import SYSTEM, magnets, run
 
 from magenv.actions import WRENCH_FORCE_N, WRENCH_TORQUE_NM, Actions
 from magenv.params import PLANTS, Body, Plant, TaskParams
-from magenv.trajectories import approach, draw
+from magenv.trajectories import draw, shaped
 from magenv.world import LOSSES, World
 
 
 def test_world_measures_the_true_state_at_every_substep(rng: np.random.Generator) -> None:
     """Means over a hold, values at its end and least separation, recomputed from the integrator alone."""
     plant = Plant(body=Body(drag_linear_nspm=3.0))  # slow enough to stay near for three holds of one command
-    task, trajectory = TaskParams(), approach(0.060)
+    task, trajectory = TaskParams(), shaped("approach", 0.060)
     world = World(1, SYSTEM, plant, task)
     robots = np.zeros((2, 6))
     robots[:, :3] = trajectory.at(0.0) + rng.normal(0.0, [1e-3, 1e-3, 0.05], (2, 3))
@@ -54,7 +54,7 @@ def test_world_measures_the_true_state_at_every_substep(rng: np.random.Generator
 def test_loss_is_told_at_its_first_substep() -> None:
     """A robot drifting off at a known speed crosses 30 mm at a known time, and the row stops there."""
     light = Plant(body=Body(mass_kg=1e3, inertia_kgm2=1e3, drag_linear_nspm=0.0, drag_rotational_nmsprad=0.0))
-    world, trajectory = World(1, SYSTEM, light, TaskParams()), approach(0.100)
+    world, trajectory = World(1, SYSTEM, light, TaskParams()), shaped("approach", 0.100)
     robots = np.zeros((2, 6))
     robots[:, :3] = trajectory.at(0.0)
     robots[0, 4] = 0.21  # m/s, away from the reference along y; too heavy for the magnets to matter
@@ -69,7 +69,7 @@ def test_loss_is_told_at_its_first_substep() -> None:
 
 
 def test_inactive_rows_stand_still(rng: np.random.Generator) -> None:
-    world, trajectory = World(3, SYSTEM, PLANTS["paper"], TaskParams()), approach(0.060)
+    world, trajectory = World(3, SYSTEM, PLANTS["paper"], TaskParams()), shaped("approach", 0.060)
     for row in range(3):
         robots = np.zeros((2, 6))
         robots[:, :3] = trajectory.at(0.0)
