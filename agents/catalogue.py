@@ -8,11 +8,12 @@ from agents.baseline import paper_baseline, tuned_baseline
 from agents.controller import Controller, Idle, Random
 from agents.learned import Learned
 from agents.predictive import Predictive
+from agents.steered import Steered
 from agents.store import CARD
 from magenv.params import InputError, require
 
 _SHIPPED = Path(__file__).parent / "data"
-_CLASSICAL = ("baseline", "tuned", "predictive", "predictive-robust", "idle", "random")
+_CLASSICAL = ("baseline", "tuned", "predictive", "predictive-robust", "steered", "idle", "random")
 
 _DOUBT = 0.05
 """Of ``predictive-robust``: share by which its parameters may be off."""
@@ -55,6 +56,8 @@ def controller(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = 
             return Predictive(n_epm, control_hz, plant)
         case "predictive-robust":
             return Predictive(n_epm, control_hz, plant, name, doubt=_DOUBT)
+        case "steered":
+            return Steered(control_hz)
         case "idle":
             return Idle(n_epm)
         case "random":

@@ -119,7 +119,7 @@ class TrainConfig:
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
     action: ActionMode = "home"
-    """What an action means: home, pose, step or wrench."""
+    """What an action means: home, pose, step, wrench or velocity."""
     observation: ObservationMode = "full"
     """What the agent sees: full or errors."""
     frame: Frame = "robots"

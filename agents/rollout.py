@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from agents.controller import Controller
 from agents.records import Record
 from magenv import ENV_ID
+from magenv.actions import PLANAR
 from magenv.episodes import Settings
 from magenv.outcome import NO_SOLVER
 from magenv.params import TaskParams, require
@@ -106,7 +107,7 @@ def run_episode(env: gymnasium.Env[Any, Any], controller: Controller, settings: 
         start = np.zeros(1, np.bool_)
         observation, _, terminated, truncated, info = env.step(actions[0])
         ended = terminated or truncated
-        solver.append(info["solver"] if controller.action == "wrench" else _solver(state))
+        solver.append(info["solver"] if controller.action in PLANAR else _solver(state))
         states.append(info)
         holds.append(info)
     time_s = _stack(states, "time_s")

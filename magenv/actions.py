@@ -1,10 +1,11 @@
-"""The four action modes: what a number in [-1, 1] does to the poses of the EPMs.
+"""The five action modes: what a number in [-1, 1] does to the poses of the EPMs.
 
-Mode    Size  An action is
-``home``   5 N  an offset from the home configuration in the frame carried by the robots (measured headings)
-``pose``   5 N  an absolute pose in the global frame, scaled from its bounds
-``step``   5 N  a change of the present pose
-``wrench`` 6    F_x, F_y, tau_z on each robot in the global frame, turned into poses by ``allocation``
+Mode         Size  An action is
+``home``     5 N   an offset from the home configuration in the frame carried by the robots (measured headings)
+``pose``     5 N   an absolute pose in the global frame, scaled from its bounds
+``step``     5 N   a change of the present pose
+``wrench``   6     F_x, F_y, tau_z on each robot in the global frame, turned into poses by ``allocation``
+``velocity`` 6     v_x, v_y, rate of each robot in the frame carried by the robots, turned into poses by ``steering``
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from magenv.allocation import component_scales
 from magenv.home import home_epms, home_rows, start_rows
 from magenv.kernels import kernel, typed
 from magenv.outcome import FELL_BACK, outcome_of
-from magenv.params import System, require
+from magenv.params import Plant, System, require
 from magenv.poses import (
     EPM_SIZE,
     LANES,
@@ -35,14 +36,19 @@ from magenv.poses import (
     robots_frame,
 )
 from magenv.reach import EVERYWHERE, Shell, make_allowed, project_within
+from magenv.sensitivity import COORDINATES
 from magenv.solver import best_of, relative_scale
+from magenv.steering import Steering
+from magenv.velocity import velocity_rows
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-ActionMode = Literal["home", "pose", "step", "wrench"]
+ActionMode = Literal["home", "pose", "step", "wrench", "velocity"]
+PLANAR: tuple[ActionMode, ...] = ("wrench", "velocity")
+"""Modes that ask for something of the robots, two axes and a turn of each, and solve for the poses."""
 
 STEP_ANGLE_RAD = 0.3
 STEP_RADIUS_M = 0.05
@@ -196,11 +202,17 @@ class Actions:
     """One action mode for a system: turns actions (n, size) into commanded EPMs (n, N, 6) within reach."""
 
     def __init__(
-        self, mode: ActionMode, system: System, workers: Workers | None = None, shell: Shell = EVERYWHERE
+        self,
+        mode: ActionMode,
+        system: System,
+        workers: Workers | None = None,
+        shell: Shell = EVERYWHERE,
+        plant: Plant | None = None,
+        period_s: float = 0.5,
     ) -> None:
         require(mode in get_args(ActionMode), "action", "one of " + ", ".join(get_args(ActionMode)), mode)
         self.mode = mode
-        self.size = 6 if mode == "wrench" else POSE_SIZE * system.n_epm
+        self.size = COORDINATES if mode in PLANAR else POSE_SIZE * system.n_epm
         self._system = system
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m, *shell])
@@ -211,6 +223,8 @@ class Actions:
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))
         self._starts = np.concatenate([self._home[None], self._home[None], fallback])
         self._scale = 1.0 / component_scales()
+        self._period_s = period_s
+        self._steering = Steering.of(system, plant or Plant(), period_s, self.home_epms)
 
     def constants(self) -> dict[str, Any]:
         """Return what the kernels of all modes take that never changes, by the names of ``magenv.state.State``."""
@@ -224,6 +238,7 @@ class Actions:
             "ipm_moment": self._system.ipm_moment_am2,
             "nominal_epm_moment": self._system.epm_moment_am2,
             "home_epms": self.home_epms,
+            "steering": self._steering,
         }
 
     def home(self, measured: Floats) -> Floats:
@@ -237,7 +252,12 @@ class Actions:
         self._workers.run(start_rows, len(mask), mask, measured, self.home_epms, epms)
 
     def to_epms(
-        self, actions: Floats, measured: Floats, epms: Floats, active: Bools | None = None
+        self,
+        actions: Floats,
+        measured: Floats,
+        epms: Floats,
+        active: Bools | None = None,
+        before: Floats | None = None,
     ) -> tuple[Floats, Bools]:
         """Return the commanded EPMs (n, N, 6) and where the least gap or reach made them differ from the action.
 
@@ -251,17 +271,22 @@ class Actions:
             Present EPMs.
         active : ndarray, shape (n,), optional
             Where a command is wanted; elsewhere the answer is undefined.
+        before : ndarray, shape (n, 2, 3), optional
+            Poses of the robots a control period earlier; by default they are at rest.
         """
         active = np.ones(len(epms), np.bool_) if active is None else active
         targets, projected, solver = np.array(epms), np.empty(len(epms), np.bool_), np.zeros(len(epms), np.int64)
         present = np.ascontiguousarray(epms)
-        self.command(actions, np.ascontiguousarray(measured), present, active, targets, projected, solver)
+        measured = np.ascontiguousarray(measured)
+        before = measured if before is None else np.ascontiguousarray(before)
+        self.command(actions, measured, before, present, active, targets, projected, solver)
         return targets, projected
 
     def command(
         self,
         actions: Floats,
         measured: Floats,
+        before: Floats,
         epms: Floats,
         active: Bools,
         targets: Floats,
@@ -270,7 +295,7 @@ class Actions:
     ) -> None:
         """Write what ``to_epms`` returns into ``targets`` (n, N, 6) and ``projected`` (n,), in active rows alone.
 
-        ``targets`` hold the last commands, and ``solver`` (n,) is written by ``wrench_rows`` alone.
+        ``targets`` hold the last commands, and ``solver`` (n,) is written in the modes ``PLANAR`` alone.
         """
         n, run = len(epms), self._workers.run
         if self.mode == "home":
@@ -279,6 +304,22 @@ class Actions:
             run(pose_rows, n, active, actions, self._low, self._high, self._limits, targets, projected)
         elif self.mode == "step":
             run(step_rows, n, active, actions, epms, self._limits, targets, projected)
+        elif self.mode == "velocity":
+            run(
+                velocity_rows,
+                n,
+                active,
+                actions,
+                measured,
+                before,
+                self._period_s,
+                epms,
+                self._steering,
+                self._limits,
+                targets,
+                projected,
+                solver,
+            )
         else:
             run(
                 wrench_rows,

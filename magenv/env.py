@@ -37,10 +37,13 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | ``pose`` | absolute pose, global frame: azimuths +-pi, elevations +-pi/2, radius 0.15 .. 0.5 m |
     | ``step`` | change of the present pose: angles +-0.3 rad, radius +-50 mm |
     | ``wrench`` | ``Box(-1, 1, (6,))``: F_x, F_y (20 mN), tau_z (1 mN m) per robot, global frame |
+    | ``velocity`` | ``Box(-1, 1, (6,))``: v_x, v_y (10 mm/s), rate (0.5 rad/s) per robot, robots' frame |
 
-    Wrenches are turned into poses by ``magenv.allocation``; ``info["solver"]``, in this mode alone, is a code into
-    ``magenv.outcome.OUTCOMES``: whether they are exerted to a tenth, whether the nearest in reach misses them, or
-    whether nothing was found and the EPMs stay where they were commanded to last.
+    Wrenches are turned into poses by ``magenv.allocation``, velocities over the coming hold by ``magenv.steering``,
+    both by nominal magnets, drags and masses; ``info["solver"]``, in these modes alone, is a code into
+    ``magenv.outcome.OUTCOMES``: whether a wrench is exerted to a tenth, or a motion met to 0.2 mm and 0.3 degrees;
+    whether the nearest in reach misses it; or whether nothing was found and the EPMs stay where they were commanded to
+    last.
 
     EPMs that would come closer to each other than their mutual attraction allows (98.1 N) are moved apart, those that
     would be out of their arms' reach are moved within it; ``info["projected"]`` says so.

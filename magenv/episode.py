@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magenv.actions import PLANAR
 from magenv.episodes import Episodes, check_action
 from magenv.state import type_of
 from magenv.steps import begin_one, one_kernel
@@ -30,7 +31,7 @@ class Episode:
         types = (type_of(self._packed),)
         self._step, self._begin = step.compile(types), begin.compile(types)
         self._draw = functools.partial(episodes.draw, state.every)
-        self._solves = episodes.settings.action == "wrench"
+        self._solves = episodes.settings.action in PLANAR
         self._action = state.action[0]
         self._shape = self._action.shape
         self._observation = state.observation[0].copy

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from magenv.actions import ActionMode, Actions
+from magenv.actions import PLANAR, ActionMode, Actions
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, POSE_SIZE
 from magenv.random_knots import RANDOM_EXTENT
@@ -103,7 +103,8 @@ class Episodes:
             self.system, plant.workspace_radius_m, self.task.period_s, settings.observation, settings.frame
         )
         self._workers = Workers(threads)
-        self.actions = Actions(settings.action, self.system, self._workers, Shell.of(self.system, plant))
+        shell = Shell.of(self.system, plant)
+        self.actions = Actions(settings.action, self.system, self._workers, shell, plant, self.task.period_s)
         reach_and_gap = RANDOM_EXTENT if trajectory is None else extent(trajectory)
         check_extent(reach_and_gap, plant, "scenario", f"{settings.scenario!r} on {settings.plant!r}")
         self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
@@ -258,9 +259,9 @@ class Episodes:
     def step_info(self) -> dict[str, NDArray[Any]]:
         """Return errors, separations, loss and reward terms of the last hold, arrays of length n, newly allocated.
 
-        In the ``wrench`` mode also how the allocation ended.
+        In the modes that solve for poses (``actions.PLANAR``) also how that ended.
         """
         s = self.state
         values = (*s.numbers.copy(), *s.counts.copy(), *s.paid[:-1].copy(), s.projected.copy())
         info = dict(zip(_STEP_KEYS, values, strict=True))
-        return info | {"solver": s.solver.copy()} if self.actions.mode == "wrench" else info
+        return info | {"solver": s.solver.copy()} if self.actions.mode in PLANAR else info

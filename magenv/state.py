@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from magenv.kernels import kernel
 from magenv.magnets import Size
+from magenv.steering import Steering
 from magenv.streams import Keys
 from magenv.travel import Motion
 
@@ -81,7 +82,7 @@ class State(NamedTuple):
     projected: Bools
     """(n,) whether the least gap or reach made them differ from the action."""
     solver: Integers
-    """(n,) how the allocation of a ``wrench`` ended, codes into ``outcome.OUTCOMES``; else 0."""
+    """(n,) how the search for poses ended in ``wrench`` and ``velocity``, codes into ``outcome.OUTCOMES``; else 0."""
     home: Floats
     """(5 N,) pose at home."""
     low: Floats
@@ -93,6 +94,7 @@ class State(NamedTuple):
     """(k, 5 N) starts of the allocation."""
     wrench_scale: Floats
     """(10,)"""
+    steering: Steering
     ipm_moment: float
     nominal_epm_moment: float
 
@@ -147,20 +149,24 @@ class _Packed(structref.StructRefProxy):
 structref.define_proxy(_Packed, _PackedType, State._fields)  # type: ignore[no-untyped-call]
 
 
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return an array without its owner, a tuple with all its arrays so, anything else as it is."""
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = array.meminfo.type(None)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        parts = [_without_owner(context, builder, part, builder.extract_value(value, i)) for i, part in enumerate(kind)]
+        return context.make_tuple(builder, kind, parts)
+    return value
+
+
 @intrinsic
 def _uncounted(_: Any, state: Any) -> Any:
     """Return the tuple, its arrays without owners: counting references to them took a fifth of a short step."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        parts = []
-        for i, kind in enumerate(state):
-            part = builder.extract_value(arguments[0], i)
-            if isinstance(kind, types.Array):
-                array = context.make_array(kind)(context, builder, part)
-                array.meminfo = array.meminfo.type(None)
-                part = array._getvalue()
-            parts.append(part)
-        return context.make_tuple(builder, state, parts)
+        return _without_owner(context, builder, state, arguments[0])
 
     return state(state), generate
 

@@ -23,6 +23,7 @@ from magenv.state import State
 from magenv.task import observe_rows, reward_terms
 from magenv.trajectories import trajectory_of
 from magenv.uncertainty import add_noise, draw_plants
+from magenv.velocity import velocity_rows
 from magenv.world import begin_rows, describe_rows, time_of
 
 Floats = NDArray[np.float64]
@@ -73,6 +74,25 @@ def _wrench(first: int, last: int, active: Bools, actions: Floats, s: State) -> 
         s.ipm_moment,
         s.nominal_epm_moment,
         s.wrench_scale,
+        s.limits,
+        s.targets,
+        s.projected,
+        s.solver,
+    )
+
+
+@kernel
+def _velocity(first: int, last: int, active: Bools, actions: Floats, s: State) -> None:
+    velocity_rows(
+        first,
+        last,
+        active,
+        actions,
+        s.measured,
+        s.before,
+        s.period,
+        s.epms,
+        s.steering,
         s.limits,
         s.targets,
         s.projected,
@@ -290,6 +310,8 @@ def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: boo
             _pose(first, last, active, actions, s)
         elif mode == "step":
             _step(first, last, active, actions, s)
+        elif mode == "velocity":
+            _velocity(first, last, active, actions, s)
         else:
             _wrench(first, last, active, actions, s)
         _hold(first, last, active, s, observations, *shape)
@@ -313,6 +335,8 @@ def one_kernel(
                 _pose(*_ONLY, s.every, s.action, s)
             elif mode == "step":
                 _step(*_ONLY, s.every, s.action, s)
+            elif mode == "velocity":
+                _velocity(*_ONLY, s.every, s.action, s)
             else:
                 _wrench(*_ONLY, s.every, s.action, s)
             _hold(*_ONLY, s.every, s, s.observation, *shape)

@@ -72,6 +72,8 @@ ORDER = [
     "hold",
     "world",
     "home",
+    "steering",
+    "velocity",
     "actions",
     "task",
     "starts",
