@@ -11,16 +11,20 @@ from numba import typeof
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from magenv.actions import PLANAR
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.kernels import kernel
 from magenv.state import State
 from magenv.steps import step_kernel
+from magenv.workers import Workers
 from magenv.world import Measurements
 
 Floats = NDArray[np.float64]
 Rewards = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
+THREADS = 2
+"""That share the episodes where each action is solved for, which takes most of a step; elsewhere one is as fast."""
 EPISODE_KEYS = Measurements.NUMBERS[:2]
 """Means over each episode that its last info carries beside ``is_success``."""
 
@@ -76,6 +80,7 @@ class TwoRobotsVecEnv(VecEnv):
         state, packed = self._episodes.state, self._episodes.packed
         step: Any = step_kernel(settings.action, *self._episodes.world.shape)
         add: Any = add_rows
+        self._workers = Workers(THREADS if settings.action in PLANAR else 1)
         self._step = step.compile(_types(0, n, self._all, self._sums, packed, state.observation))
         self._add = add.compile(_types(packed, self._sums, self._ends, state.bounds, self._all))
 
@@ -98,7 +103,7 @@ class TwoRobotsVecEnv(VecEnv):
         actions = check_action(self._actions, self._shape)
         observations = np.empty((n, self.layout.size), np.float32)
         rewards, dones = np.empty(n, np.float32), np.empty(n, np.bool_)
-        self._step(0, n, self._all, actions, episodes.packed, observations)
+        self._workers.run(self._step, n, self._all, actions, episodes.packed, observations)
         count = self._add(episodes.packed, self._sums, self._ends, rewards, dones)
         infos: list[dict[str, Any]] = [{} for _ in range(n)]
         if count > 0:

@@ -224,7 +224,7 @@ class Actions:
         self._starts = np.concatenate([self._home[None], self._home[None], fallback])
         self._scale = 1.0 / component_scales()
         self._period_s = period_s
-        self._steering = Steering.of(system, plant or Plant(), period_s, self.home_epms)
+        self._steering = Steering.of(system, plant or Plant(), period_s)
 
     def constants(self) -> dict[str, Any]:
         """Return what the kernels of all modes take that never changes, by the names of ``magenv.state.State``."""

@@ -11,7 +11,6 @@ from scipy.linalg import expm
 
 from magenv.actions import Actions
 from magenv.episodes import Episodes, Settings
-from magenv.home import home_epms
 from magenv.outcome import CONVERGED, FELL_BACK
 from magenv.params import Plant, System
 from magenv.poses import from_cartesian, robots_frame
@@ -56,7 +55,7 @@ def test_growth_is_the_norm_of_the_exponential(rng: np.random.Generator, size: f
 def test_what_is_foreseen_solves_the_equation_of_motion(rng: np.random.Generator, period: float) -> None:
     """M q'' + D q' = F + K q from rest and from a velocity, against the exponential of the whole linear system."""
     plant = Plant()
-    s = Steering.of(System(), plant, period, home_epms(2))
+    s = Steering.of(System(), plant, period)
     w, body = workspace(s), plant.body
     inertia = np.tile([body.mass_kg, body.mass_kg, body.inertia_kgm2], 2)
     half = 0.5 * rng.normal(size=(COORDINATES, COORDINATES)) / s.root / s.root[:, None]  # rates of a few per second
@@ -116,7 +115,7 @@ def test_a_hold_is_sought_in_which_errors_grow_little(rng: np.random.Generator) 
     robots, system = apart(rng, 32, 0.045), System()
     actions = Actions("velocity", system)
     epms, _ = actions.to_epms(np.zeros((32, COORDINATES)), robots, actions.home(robots))
-    s = Steering.of(system, Plant(), PERIOD_S, home_epms(2))
+    s = Steering.of(system, Plant(), PERIOD_S)
 
     grown = []
     for robot, epm in zip(robots, epms, strict=True):
