@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.checkpoints import BEST, MODEL, best_so_far, checkpoints, save_model
 from agents.configs import TrainConfig
 from agents.evaluation import HeldOut, Score
+from agents.store import NotFiniteError
 from magenv.command import RunError
 
 KEPT_CHECKPOINTS = 2
@@ -134,4 +135,7 @@ class Keeper(BaseCallback):
                 shutil.rmtree(other)
 
     def _save(self, folder: Path, with_training: bool) -> None:
-        save_model(folder, self.model, self._env, self._config, with_training, self._command, self.score)
+        try:
+            save_model(folder, self.model, self._env, self._config, with_training, self._command, self.score)
+        except NotFiniteError as error:  # an optimiser's averages, which squares overflow first
+            raise self._diverged("optimisers are not finite") from error

@@ -71,6 +71,10 @@ class Normalisation:
     count: float
 
 
+class NotFiniteError(InputError):
+    """Tensors to be stored that are not finite."""
+
+
 def check_replaceable(folder: Path) -> None:
     """Raise ``ValueError`` where something stands in the place of a model's folder that is no model."""
     foreign = folder.exists() and not (folder / CARD).is_file()
@@ -89,12 +93,15 @@ def save(
     Raises
     ------
     ValueError
-        If something else stands there, or a tensor is not finite.
+        If something else stands there.
+    NotFiniteError
+        If a tensor is not finite; nothing has been written then.
     """
     check_replaceable(folder)
     numbers = (torch.from_numpy(np.stack([normalisation.mean, normalisation.variance])), *policy.values())
     finite = all(bool(torch.isfinite(value).all()) for value in (*numbers, *(training or {}).values()))
-    require(finite, "model", "of finite numbers to be stored", str(folder))
+    if not finite:
+        raise NotFiniteError(f"Input model must be of finite numbers to be stored; instead received {str(folder)!r}.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"

@@ -182,11 +182,18 @@ def blown_up(model: BaseAlgorithm) -> None:
             parameter.copy_(torch.full_like(parameter, 3e38) * (-1.0) ** torch.arange(parameter.shape[-1]))
 
 
+def overflown(model: BaseAlgorithm) -> None:
+    model.policy.optimizer.state_dict()["state"][0]["exp_avg_sq"][0] = math.inf
+
+
 def without_loss(model: BaseAlgorithm) -> None:
     model.logger.record("train/value_loss", math.nan)
 
 
-@pytest.mark.parametrize(("how", "what"), [(poisoned, "parameters"), (blown_up, "actions"), (without_loss, "the loss")])
+@pytest.mark.parametrize(
+    ("how", "what"),
+    [(poisoned, "parameters"), (blown_up, "actions"), (without_loss, "the loss")],
+)
 def test_a_training_that_diverges_stops_and_what_was_good_stays(
     make_config: MakeConfig, after_update: Callable[..., None], how: Callable[[PPO], None], what: str
 ) -> None:
@@ -202,6 +209,15 @@ def test_a_training_that_diverges_stops_and_what_was_good_stays(
         Learned(folder)
     _, finished = train(going_on(out))  # its first update is not the third
     assert finished
+
+
+def test_an_optimiser_that_overflows_is_noticed_before_it_is_stored(
+    make_config: MakeConfig, after_update: Callable[..., None]
+) -> None:
+    after_update(overflown)
+    with pytest.raises(DivergedError, match=r"^The training diverged within 512 steps \(optimisers .*-0*384\.$"):
+        train(make_config())
+    assert steps_of(make_config().out) == [256, 384]
 
 
 @both
