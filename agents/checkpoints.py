@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,27 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.configs import PPOConfig, SACConfig, TrainConfig
+from agents.evaluation import Score
 from agents.learned import load_weights
 from agents.store import (
+    CARD,
     Card,
     Normalisation,
+    check_replaceable,
     flatten,
     load_card,
     load_policy,
     load_training,
+    recover,
     save,
     unflatten_like,
 )
 from magenv.params import InputError, require
 
 _OPTIMISERS = {"ppo": ("policy.optimizer",), "sac": ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")}
+
+MODEL, BEST = "model", "best"
+"""Folders in that of a run: the last policy, and the best on the held-out episodes."""
 
 GOING_ON = ("steps", "out", "resume", "checkpoint_every")
 """What may be changed when a run is gone on with."""
@@ -49,7 +57,13 @@ def _attribute(model: BaseAlgorithm, path: str) -> Any:
 
 
 def save_model(
-    folder: Path, model: BaseAlgorithm, env: VecNormalize, config: TrainConfig, with_training: bool, command: str
+    folder: Path,
+    model: BaseAlgorithm,
+    env: VecNormalize,
+    config: TrainConfig,
+    with_training: bool,
+    command: str,
+    score: Score | None = None,
 ) -> None:
     """Write the agent as it is now (see ``agents.store``), with its optimisers where asked."""
     own = config.ppo if config.algo == "ppo" else config.sac
@@ -58,7 +72,7 @@ def save_model(
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
-        dataclasses.replace(card, command=command),
+        dataclasses.replace(card, command=command, score=score),
         model.policy.state_dict(),
         Normalisation(statistics.mean, statistics.var, statistics.count),
         training,
@@ -111,6 +125,28 @@ def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.T
 def checkpoints(run: Path) -> list[Path]:
     """Return the run's checkpoints, oldest first."""
     return sorted(path for path in (Path(run) / "checkpoints").glob("step-*") if path.name[5:].isdigit())
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder holds a run: one that has come to its first checkpoint."""
+    return bool(checkpoints(folder)) or (folder / MODEL).exists()
+
+
+def best_so_far(config: TrainConfig) -> Score | None:
+    """Return the score of the run's best model so far, which stands in the run's folder from now on; None without one.
+
+    That of a run gone on with elsewhere is copied. What stands in a new run's folder was left by one that was killed
+    before its first checkpoint, and is dropped.
+    """
+    best, resume = config.folder / BEST, config.resume
+    recover(best)
+    check_replaceable(best)
+    if resume is None or resume.resolve() != config.folder.resolve():
+        if best.exists():
+            shutil.rmtree(best)
+        if resume is not None and (resume / BEST / CARD).is_file():
+            save(best, load_card(resume / BEST), *load_policy(resume / BEST))
+    return load_card(best).score if best.exists() else None
 
 
 def stored_config(run: Path) -> TrainConfig:

@@ -131,12 +131,17 @@ class TrainConfig:
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None
-    """Folder for model, checkpoints, progress.csv and report; by default runs/train (runs/train-2, ... where it holds a
-    run), or that of --resume."""
+    """Folder for models, checkpoints, progress.csv and report; by default runs/train (runs/train-2, ... where it holds
+    a run), that of --resume, or with --tune runs/tune."""
     resume: Path | None = None
     """Folder of a run to go on with, as it was configured; --steps, --out and --checkpoint-every may change."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints; by default a tenth of all, at most 250,000."""
+    """Steps between checkpoints, at each of which the policy is judged on held-out episodes; by default a tenth of all,
+    at most 250,000."""
+    tune: bool = False
+    """Search for hyperparameters of the algorithm instead, by trials with a tenth of the steps; needs Optuna."""
+    trials: int | None = None
+    """Trials of --tune; by default 20."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 
@@ -147,6 +152,10 @@ class TrainConfig:
         _whole(0, 2**32 - 1, seed=self.seed)
         if self.checkpoint_every is not None:
             _whole(1, math.inf, checkpoint_every=self.checkpoint_every)
+        require(not self.tune or self.resume is None, "tune", "given without --resume", str(self.resume))
+        if self.trials is not None:
+            require(self.tune, "trials", "given with --tune", self.trials)
+            _whole(1, math.inf, trials=self.trials)
 
     @property
     def folder(self) -> Path:

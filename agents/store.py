@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from agents.configs import check_net
+from agents.evaluation import Score
 from magenv.episodes import Settings
 from magenv.params import InputError, require
 
@@ -48,6 +50,8 @@ class Card:
     """Of the packages that made it."""
     command: str = ""
     """Command that made it."""
+    score: Score | None = None
+    """On the held-out episodes of its training; None where it was not judged, as before there were any."""
 
     @classmethod
     def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
@@ -67,6 +71,10 @@ class Normalisation:
     count: float
 
 
+class NotFiniteError(InputError):
+    """Tensors to be stored that are not finite."""
+
+
 def check_replaceable(folder: Path) -> None:
     """Raise ``ValueError`` where something stands in the place of a model's folder that is no model."""
     foreign = folder.exists() and not (folder / CARD).is_file()
@@ -80,8 +88,20 @@ def save(
     normalisation: Normalisation,
     training: Mapping[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write a model folder whole or not at all; a folder that stood there is replaced."""
+    """Write a model folder whole or not at all; a folder that stood there is replaced.
+
+    Raises
+    ------
+    ValueError
+        If something else stands there.
+    NotFiniteError
+        If a tensor is not finite; nothing has been written then.
+    """
     check_replaceable(folder)
+    numbers = (torch.from_numpy(np.stack([normalisation.mean, normalisation.variance])), *policy.values())
+    finite = all(bool(torch.isfinite(value).all()) for value in (*numbers, *(training or {}).values()))
+    if not finite:
+        raise NotFiniteError(f"Input model must be of finite numbers to be stored; instead received {str(folder)!r}.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"
@@ -104,6 +124,16 @@ def save(
             raise
 
 
+def recover(folder: Path) -> None:
+    """Finish or drop what a process killed within ``save`` left beside a model's folder; nobody may be writing it."""
+    for scratch in folder.parent.glob(f"{folder.name}.*"):
+        left = {path.name for path in scratch.iterdir()} if scratch.is_dir() else {"a file"}
+        if left <= {"new", "old"}:
+            if "old" in left and not folder.exists():  # killed between the two moves: the new one is whole
+                os.replace(scratch / "new", folder)
+            shutil.rmtree(scratch)
+
+
 def load_card(folder: Path) -> Card:
     """Read and check a model's card.
 
@@ -123,6 +153,8 @@ def load_card(folder: Path) -> Card:
     try:
         raw["settings"] = Settings(**raw["settings"])
         raw["net"] = tuple(raw["net"])
+        if raw.get("score") is not None:
+            raw["score"] = Score(**raw["score"])
         card = Card(**raw)
     except (KeyError, TypeError) as error:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error

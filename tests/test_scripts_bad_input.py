@@ -46,6 +46,10 @@ BAD = {
     "train seed": ("train.py", ["--seed", "-1"], "from 0 to 4294967295; instead received -1"),
     "train gamma": ("train.py", ["--ppo.gamma", "2"], "error: Input gamma must be .* at most 1.*2"),
     "train net": ("train.py", ["--ppo.net", "0"], "widths.*0"),
+    "trials without a search": ("train.py", ["--trials", "3"], "trials must be given with --tune; instead received 3"),
+    "no trials": ("train.py", ["--tune", "--trials", "0"], "trials.*at least 1.*0"),
+    "search in a run": ("train.py", ["--tune", "--resume", "runs/nothing"], "tune must be given without --resume"),
+    "search on no plant": ("train.py", ["--tune", "--plant", "moon"], "paper.*'moon'"),
     "tune candidates": ("agents/tune.py", ["--candidates", "0"], "candidates.*at least 1.*0"),
     "train resume": ("train.py", ["--resume", "runs/nothing"], "checkpoints.*'runs/nothing'"),
 }
