@@ -73,7 +73,7 @@ def test_ctrl_c_right_after_a_resume_keeps_what_was_there(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from safetensors.torch import save_file
+from safetensors.numpy import save_file
 import agents.store
 from agents.configs import PPOConfig, TrainConfig
 from agents.learning import train
