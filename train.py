@@ -40,7 +40,9 @@ def main() -> None:
         raise KeyboardInterrupt
     agent = Learned(folder / MODEL)
     s = agent.settings
-    floor = [controller(name, s.n_epm, s.control_hz) for name in ("baseline", "idle", "random")]
+    corrects = [] if agent.card.residual is None else [agent.card.residual.controller]
+    beside = dict.fromkeys((*corrects, "baseline", "idle", "random"))
+    floor = [controller(name, s.n_epm, s.control_hz, s.plant) for name in beside]
     compare([agent, *floor], SCENARIOS, s.plant, s.n_epm, s.control_hz, EPISODES, 0, folder, command_line())
 
 

@@ -8,25 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.evaluation import Score
-from agents.learned import load_weights
+from agents.networks import flatten, load_weights, unflatten_like
 from agents.store import (
     CARD,
     Card,
     Normalisation,
     check_replaceable,
-    flatten,
     load_card,
     load_policy,
     load_training,
     recover,
     save,
-    unflatten_like,
 )
 from magenv.params import InputError, require
 
@@ -67,13 +66,13 @@ def save_model(
 ) -> None:
     """Write the agent as it is now (see ``agents.store``), with its optimisers where asked."""
     own = config.ppo if config.algo == "ppo" else config.sac
-    card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config)
+    card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config.resolved)
     statistics: Any = env.obs_rms
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
-        dataclasses.replace(card, command=command, score=score),
-        model.policy.state_dict(),
+        dataclasses.replace(card, command=command, score=score, residual=config.correction),
+        flatten(dict(model.policy.state_dict())),
         Normalisation(statistics.mean, statistics.var, statistics.count),
         training,
     )
@@ -106,7 +105,7 @@ def restore(folder: Path, model: BaseAlgorithm, env: VecNormalize, algo: str) ->
     model.num_timesteps = load_card(folder).steps
 
 
-def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.Tensor]) -> dict[str, Any]:
+def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Return an optimiser's state dictionary from its flattened form, checked against the parameters it is for."""
     groups = unflatten_like(optimiser.state_dict()["param_groups"], stored, "param_groups")
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
@@ -118,7 +117,7 @@ def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.T
             require(known, "checkpoint", "of optimisers of this model", key)
             shape = parameters[int(part[1])].shape if part[2] != "step" else torch.Size()
             require(value.shape == shape, f"checkpoint's {key}", f"of shape {tuple(shape)}", tuple(value.shape))
-            state.setdefault(int(part[1]), {})[part[2]] = value
+            state.setdefault(int(part[1]), {})[part[2]] = torch.from_numpy(value)
     return {"state": state, "param_groups": groups}
 
 

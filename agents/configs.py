@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from agents.residual import Correction
 from magenv.actions import ActionMode
 from magenv.episodes import Settings
 from magenv.params import require
@@ -118,14 +119,19 @@ class TrainConfig:
     """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
-    action: ActionMode = "home"
-    """What an action means: home, pose, step, wrench or velocity."""
+    action: ActionMode | None = None
+    """What an action means: home, pose, step, wrench or velocity; by default home, or as of the controller of
+    --residual."""
     observation: ObservationMode = "full"
     """What the agent sees: full or errors."""
     frame: Frame = "robots"
     """Frame of the observation: robots or global."""
     control_hz: float = 2.0
     """Control rate."""
+    residual: str | None = None
+    """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
+    residual_scale: float = 0.1
+    """How far the policy may correct it, of the bounds of an action: above 0, at most 1."""
     steps: int | None = None
     """Environment steps; by default 3 million (ppo) or 200,000 (sac)."""
     seed: int = 0
@@ -156,6 +162,12 @@ class TrainConfig:
         if self.trials is not None:
             require(self.tune, "trials", "given with --tune", self.trials)
             _whole(1, math.inf, trials=self.trials)
+        _ = self.correction  # which checks what it is made of
+
+    @property
+    def correction(self) -> Correction | None:
+        """What the policy corrects; None where it acts by itself."""
+        return None if self.residual is None else Correction(self.residual, self.residual_scale)
 
     @property
     def folder(self) -> Path:
@@ -165,11 +177,15 @@ class TrainConfig:
         return folder
 
     @property
+    def resolved(self) -> TrainConfig:
+        """The same training with its action mode told, whichever it is by default."""
+        return replace(self, action=self.settings.action)
+
+    @property
     def settings(self) -> Settings:
         """The environment."""
-        return Settings(
-            self.scenario, self.plant, self.n_epm, self.action, self.observation, self.frame, self.control_hz
-        )
+        action = self.action or ("home" if self.correction is None else self.correction.action)
+        return Settings(self.scenario, self.plant, self.n_epm, action, self.observation, self.frame, self.control_hz)
 
     @property
     def checkpoint_steps(self) -> int:

@@ -17,6 +17,8 @@ from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
 
 EPISODES = 64
+EPISODES_CORRECTED = 16
+"""Where the policy corrects a controller: ``predictive`` takes up to 10 ms a decision, a minute or two for all 64."""
 SEED = 2**40
 """Of the first held-out episode; the others follow. Trainings, like ``evaluate.py``, stay far below."""
 POSITION_UNIT_MM, HEADING_UNIT_DEG = 1.0, 5.0
@@ -58,10 +60,10 @@ class Score:
 
 
 class HeldOut:
-    """The held-out episodes of an environment."""
+    """The held-out episodes of an environment, the first of them where fewer are asked for."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._episodes = Episodes(EPISODES, settings)
+    def __init__(self, settings: Settings, episodes: int = EPISODES) -> None:
+        self._n, self._episodes = episodes, Episodes(episodes, settings)
 
     def score(self, predict: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Score:
         """Run all episodes to their ends and return what was reached.
@@ -76,13 +78,14 @@ class HeldOut:
         ValueError
             If actions are not finite.
         """
-        episodes, active = self._episodes, np.ones(EPISODES, np.bool_)
-        for row in range(EPISODES):
+        n, episodes = self._n, self._episodes
+        active = np.ones(n, np.bool_)
+        for row in range(n):
             episodes.seed(row, seeding.np_random(SEED + row)[0])
         observations = episodes.start(active)
-        sums, substeps, success = np.zeros((2, EPISODES)), np.zeros(EPISODES), np.zeros(EPISODES, np.bool_)
+        sums, substeps, success = np.zeros((2, n)), np.zeros(n), np.zeros(n, np.bool_)
         while active.any():
-            actions = check_action(predict(observations), (EPISODES, episodes.actions.size))
+            actions = check_action(predict(observations), (n, episodes.actions.size))
             observations = episodes.step(actions, active)
             hold = episodes.step_info()
             errors = np.stack([hold["position_error_m"], hold["heading_error_rad"]])

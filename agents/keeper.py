@@ -19,7 +19,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.checkpoints import BEST, MODEL, best_so_far, checkpoints, save_model
 from agents.configs import TrainConfig
-from agents.evaluation import HeldOut, Score
+from agents.evaluation import EPISODES, EPISODES_CORRECTED, SEED, HeldOut, Score
+from agents.residual import Corrected
+from agents.rollout import controller_seed
 from agents.store import NotFiniteError
 from magenv.command import RunError
 
@@ -48,7 +50,7 @@ class Keeper(BaseCallback):
         super().__init__()
         self.model = model
         self._config, self._env, self._command, self._watch = config, env, command, watch
-        self._held_out = HeldOut(config.settings)
+        self._held_out = HeldOut(config.settings, EPISODES if config.correction is None else EPISODES_CORRECTED)
         self._best = best_so_far(config)
         self.score: Score | None = None
         self._next_checkpoint = 0
@@ -111,19 +113,36 @@ class Keeper(BaseCallback):
 
         Neither the training's episodes, nor its random numbers, nor the statistics of observations are touched.
         """
-
-        def predict(observations: NDArray[np.float32]) -> NDArray[np.float32]:
-            normalised = self._env.normalize_obs(observations)
-            assert isinstance(normalised, np.ndarray)
-            return self._mode(normalised)
-
-        self.score = self._held_out.score(predict)
+        self.score = self._held_out.score(self._acting())
         for name, value in vars(self.score).items():
             self.logger.record(f"eval/{name}", value)
         if self._best is None or self.score.merit > self._best.merit:
             # Before the checkpoint: a run gone on with from there has been judged up to there.
             self._save(self._config.folder / BEST, False)
             self._best = self.score
+
+    def _policy(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the policy's mode (n, a) for observations (n, d) as they are told."""
+        normalised = self._env.normalize_obs(observations)
+        assert isinstance(normalised, np.ndarray)
+        return self._mode(normalised)
+
+    def _acting(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        """Return what acts in episodes that all begin at its first call: the policy, or what it corrects with it."""
+        correction = self._config.correction
+        if correction is None:
+            return self._policy
+        whole = Corrected(correction.base(self._config.settings), self._policy, correction.scale)
+        whole.seed(controller_seed(SEED))
+        state, begin = None, True
+
+        def predict(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+            nonlocal state, begin
+            actions, state = whole.predict(observations, state, np.full(len(observations), begin))
+            begin = False
+            return actions
+
+        return predict
 
     def _checkpoint(self) -> None:
         """Write a checkpoint; drop all but the run's last two, and what was left half written."""

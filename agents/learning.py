@@ -15,14 +15,16 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.checkpoints import MODEL, check_goes_on, is_run, restore
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.folders import lock_folder, new_folder
 from agents.keeper import Keeper, Watch
-from agents.learned import CLIP_OBSERVATION, policy_kwargs
+from agents.networks import policy_kwargs
+from agents.player import CLIP_OBSERVATION
 from agents.progress import Reporter, logger
+from agents.residual_vec import ResidualVecEnv
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import check_replaceable, recover
 from magenv.params import InputError
@@ -38,9 +40,10 @@ def _falling(start: float) -> Any:
 def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
     """Return the untrained agent and its normalised environments."""
     own = config.ppo if config.algo == "ppo" else config.sac
-    env = VecNormalize(
-        TwoRobotsVecEnv(own.n_envs, config.settings, config.seed), norm_reward=False, clip_obs=CLIP_OBSERVATION
-    )
+    robots: VecEnv = TwoRobotsVecEnv(own.n_envs, config.settings, config.seed)
+    if config.correction is not None:
+        robots = ResidualVecEnv(robots, config.correction.base(config.settings), config.correction.scale)
+    env = VecNormalize(robots, norm_reward=False, clip_obs=CLIP_OBSERVATION)
     kwargs = policy_kwargs(config.algo, own.net)
     if isinstance(own, PPOConfig):
         kwargs["log_std_init"] = own.log_std_init

@@ -155,6 +155,13 @@ print(sorted({{name.split(".")[0] for name in sys.modules}} & {{
     assert done.stderr == ""
 
 
+def test_torch_is_for_training_alone() -> None:
+    learns = {"torch", "stable_baselines3"}
+    files = (PACKAGE.parent / "agents").glob("*.py")
+    found = {path.stem for path in files if learns & {name.split(".")[0] for name in imports(path)}}
+    assert found == {"networks", "sb3_vec", "residual_vec", "checkpoints", "keeper", "progress", "learning"}
+
+
 def test_importing_the_package_registers_the_env_alone() -> None:
     code = "import sys, magenv; print(sorted(n for n in sys.modules if n.startswith('magenv.')))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
