@@ -18,6 +18,7 @@ ORDER = [
     "params",
     "files",
     "command",
+    "origin",
     "kernels",
     "arithmetic",
     "angles",
