@@ -13,7 +13,7 @@ from agents import catalogue
 from agents.statistics import probability_of_improvement
 from agents.study import trainings
 from agents.study.entries import Entry, Made, Outcomes, load_all
-from agents.study.trainings import MAIN, TRAININGS, Training, check_told
+from agents.study.trainings import MAIN, Training, check_told
 from magenv.params import require
 
 Floats = NDArray[np.float64]
@@ -134,7 +134,7 @@ def collect(store: Path) -> list[Measured]:
             chosen.sort(key=lambda entry: -1 if entry.training is None else entry.training.seed)
             alike = {tuple(entry.outcomes) for entry in chosen}
             require(len(alike) == 1, str(store / name), "of the same scenarios with all seeds", sorted(alike))
-            training = next((one for one in TRAININGS if one.name == name), None)
+            training = trainings.training(name) if name in trainings.names() else None
             measured.append(Measured(name, tuple(chosen), training))
     return measured
 
