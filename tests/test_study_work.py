@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
-import subprocess
 import sys
 from pathlib import Path
 
+import joblib
 import numpy as np
 import pytest
 from messages import refusal
@@ -226,15 +225,21 @@ def test_bad_input_is_refused_in_a_line_and_leaves_nothing(
     assert list(itertools.islice(Path().iterdir(), 1)) == []
 
 
-def test_the_command_lists_all_trainings(tmp_path: Path) -> None:
-    root = Path(work.__file__).parents[2]
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "agents.study", "list"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    for one in TRAININGS:
-        assert f"{one.name} ({one.group}): {one.shows}\n" in done.stdout
+def test_the_command_lists_all_trainings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    run_tiny(monkeypatch)
+    capsys.readouterr()
+    call(monkeypatch, "list")
+    told = capsys.readouterr().out
+    for one in (*TRAININGS, TINY):
+        assert f"{one.name} ({one.group}): {one.shows}\n" in told
+    assert "\n  seeds 0 1, kept: 1\n" in told
+
+
+def test_trainings_side_by_side_come_to_the_same_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One after the other here: processes, each of which loads torch, take too long for a test."""
+    monkeypatch.setattr(work, "parallel_config", lambda **_: joblib.parallel_config(backend="sequential"))
+    call(monkeypatch, "run", "tiny", "--episodes", "1", "--jobs", "2")
+    for seed in TINY.seeds:
+        entry = entries.load(Path(f"docs/study/tiny/seed-{seed}.json"))
+        model = Path(f"runs/study/tiny/seed-{seed}/model")
+        assert entry.outcomes == {SCENARIO: entries.outcomes_of(run(controller(str(model)), SCENARIO, episodes=1))}

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subco
 from agents.study import work
 from agents.study.entries import file_of
 from agents.study.report import write_results
-from agents.study.trainings import TRAININGS, command, training
+from agents.study.trainings import command, names, training
 from magenv.command import friendly, parse
 from magenv.params import is_whole, require
 
@@ -54,7 +54,7 @@ class List:
 
     def do(self) -> None:
         """Print."""
-        for one in TRAININGS:
+        for one in map(training, names()):
             kept = [str(seed) for seed in one.seeds if (self.store / file_of(one.name, seed)).is_file()]
             print(f"{one.name} ({one.group}): {one.shows}")
             print(f"  seeds {' '.join(map(str, one.seeds))}, kept: {' '.join(kept) or 'none'}")
