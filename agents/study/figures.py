@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from agents.figures import DPI, colour_of
 from agents.statistics import bounds, share_above
 from agents.study.entries import Curve
-from agents.study.evidence import Measured
+from agents.study.evidence import Measured, OfEpisodes, mean_kept, success_rate
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +24,8 @@ _COLOURS = ("#0072B2", "#56B4E9", "#CC79A7", "#000000", "#8C510A", "#7B3294", "#
 """Of agents, in their order; those of controllers are others."""
 _INK, _GRID = "#222222", "#E5E5E5"
 _POINTS = 150
+_WIDTH = 0.8
+"""Of a scenario's marks."""
 _COLUMNS = 4
 _LABELS = {"position_error_mm": "position error (mm)", "heading_error_deg": "heading error (degrees)"}
 _BAND = 0.14
@@ -36,6 +38,60 @@ def style(one: Measured, measured: Sequence[Measured]) -> dict[str, object]:
     if one.training is None:
         return {"color": colour_of(one.name, [other.name for other in measured]), "linestyle": (0, (4, 1.5))}
     return {"color": _COLOURS[agents.index(one.label) % len(_COLOURS)], "linestyle": "-"}
+
+
+def overview(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
+    """Draw success and errors on each scenario: per agent or controller the median of its seeds, and each seed."""
+    figure = _figure(11.5, 8.2)
+    rows: list[tuple[str, OfEpisodes]] = [
+        ("success (%)", lambda outcomes: 100 * success_rate(outcomes)),
+        *((label, mean_kept(column)) for column, label in _LABELS.items()),
+    ]
+    panels = figure.subplots(len(rows), 1, sharex=True)
+    for axes, (title, of_episodes) in zip(panels, rows, strict=True):
+        for index, one in enumerate(measured):
+            beside = _WIDTH * ((index + 0.5) / len(measured) - 0.5)
+            colour, mark = str(style(one, measured)["color"]), "D" if one.training is None else "o"
+            for place, scenario in enumerate(scenarios):
+                values = one.per_seed(scenario, of_episodes) if one.measured_on([scenario]) else np.zeros(0)
+                values = values[~np.isnan(values)]
+                at = np.full(len(values), place + beside)
+                axes.plot(at, values, mark, color=colour, markersize=4, alpha=0.5, markeredgewidth=0)
+                if len(values):
+                    axes.plot(at[:1], [np.median(values)], mark, color=colour, markersize=8, markeredgewidth=0)
+        for border in range(1, len(scenarios)):
+            axes.axvline(border - 0.5, color=_GRID, linewidth=1.0)
+        if title != rows[0][0]:
+            axes.set_yscale("log")
+            _plain_numbers(axes.yaxis)
+        axes.set_ylabel(title, fontsize=11)
+        axes.grid(axis="y", color=_GRID, linewidth=0.6)
+        axes.set_axisbelow(True)
+    panels[0].set_ylim(-5.0, 105.0)
+    panels[-1].set_xlim(-0.5, len(scenarios) - 0.5)
+    panels[-1].set_xticks(range(len(scenarios)), scenarios, fontsize=10)
+    figure.suptitle("Success, and mean errors of the episodes that were held: medians over the seeds", fontsize=13)
+    handles = [
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="D" if one.training is None else "o",
+            markersize=8,
+            color=str(style(one, measured)["color"]),
+            label=_name(one),
+        )
+        for one in measured
+    ]
+    handles.append(Line2D([], [], linestyle="", marker="o", markersize=4, alpha=0.5, color=_INK, label="each seed"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)
+    return figure
+
+
+def _name(one: Measured) -> str:
+    """Return what legends say."""
+    several = "s" if len(one.made) > 1 else ""
+    return f"{one.label}, {len(one.made)} seed{several}" if one.made else one.label
 
 
 def profiles(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
@@ -154,9 +210,9 @@ def _figure(width: float, height: float) -> Figure:
 
 
 def _legend(figure: Figure, chosen: Sequence[Measured], measured: Sequence[Measured], band: str) -> None:
-    handles: list[Line2D | Patch] = []
-    for one in chosen:
-        seeds = f", {len(one.made)} seed{'s' if len(one.made) > 1 else ''}" if one.made else ""
-        handles.append(Line2D([], [], linewidth=2.2, label=one.label + seeds, **style(one, measured)))  # type: ignore[arg-type]
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], linewidth=2.2, label=_name(one), **style(one, measured))  # type: ignore[arg-type]
+        for one in chosen
+    ]
     handles.append(Patch(color=_INK, alpha=_BAND, linewidth=0, label=band))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)

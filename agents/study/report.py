@@ -75,7 +75,9 @@ def write_results(store: Path, out: Path, ladders: Sequence[Path] = ()) -> Path:
 
     page = [_HEAD, "", _MEANING.format(episodes=_episodes(measured, scenarios))]
     if main:
-        page += ["", "## Agents and controllers", "", *tables.by_scenario(main, scenarios)]
+        page += ["", "## Agents and controllers"]
+        page += picture("overview", "Success and errors on each scenario", figures.overview(main, scenarios))
+        page += ["", *tables.by_scenario(main, scenarios)]
     page += ["", "## Over all scenarios", "", _AGGREGATES, "", *tables.aggregates(measured, scenarios)]
     if main:
         page += ["", "## How exact", "", _PROFILES]
