@@ -79,13 +79,14 @@ def test_every_agent_and_controller_is_told_of(page: Path) -> None:
 @pytest.mark.parametrize("name", ["baseline", "ppo-home", "sac-home"])
 def test_numbers_are_those_of_the_records(name: str, store: Path, page: Path) -> None:
     chosen = of(store, name)
-    success, position, heading = tables(page, "Agents and controllers")
+    success, position, heading, separation = tables(page, "Agents and controllers")
     for column, scenario in enumerate(SCENARIOS, 1):
         outcomes = [entry.outcomes[scenario] for entry in chosen]
         assert success[name][column] == told([100 * np.mean(o.success) for o in outcomes], "{:.0f}")
         for table, errors in ((position, "position_error_mm"), (heading, "heading_error_deg")):
             means = [np.mean([e for e, held in zip(getattr(o, errors), o.success) if held]) for o in outcomes]  # noqa: B905
             assert table[name][column] == told([float(mean) for mean in means])
+        assert separation[name][column] == told([float(np.median(o.min_separation_mm)) for o in outcomes])
 
 
 def test_aggregates_are_interquartile_means_over_seeds_and_scenarios(store: Path, page: Path) -> None:
@@ -187,7 +188,7 @@ def test_agents_that_lose_all_have_no_error(tmp_path: Path) -> None:
     for seed in range(3):
         entries.save(an_entry("ppo-home", seed, hold=1.0 if seed == 0 else 0.0), tmp_path)
     entries.save(an_entry("baseline", hold=0.0), tmp_path)
-    success, position, _ = tables(report.write_results(tmp_path, tmp_path / "page"), "Agents and controllers")
+    success, position, *_ = tables(report.write_results(tmp_path, tmp_path / "page"), "Agents and controllers")
     assert success["baseline"][1:] == ["0"] * len(SCENARIOS)
     assert position["baseline"][1:] == ["-"] * len(SCENARIOS)
     assert all(cell.endswith(", 1 of 3 seeds") for cell in position["ppo-home"][1:])

@@ -83,6 +83,11 @@ def success_rate(outcomes: Outcomes) -> float:
     return float(np.mean(outcomes.success))
 
 
+def least_separation(outcomes: Outcomes) -> float:
+    """Return the least separation that the robots came to (mm), median over all episodes."""
+    return float(np.median(outcomes.min_separation_mm))
+
+
 def mean_kept(column: str) -> OfEpisodes:
     """Return what takes the mean of a column over the successful episodes; NaN where there is none."""
 

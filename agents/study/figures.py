@@ -83,7 +83,8 @@ def overview(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
         )
         for one in measured
     ]
-    handles.append(Line2D([], [], linestyle="", marker="o", markersize=4, alpha=0.5, color=_INK, label="each seed"))
+    if any(len(one.made) > 1 for one in measured):
+        handles.append(Line2D([], [], linestyle="", marker="o", markersize=4, alpha=0.5, color=_INK, label="each seed"))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)
     return figure
 
@@ -99,7 +100,10 @@ def profiles(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
     figure = _figure(11.5, 5.0)
     chosen = [one for one in measured if one.measured_on(scenarios)]
     for axes, column in zip(figure.subplots(1, 2), _LABELS, strict=True):
-        _profiles(axes, chosen, measured, scenarios, column)
+        thresholds = _thresholds([one.errors(scenarios, column) for one in chosen])
+        for one in chosen:
+            _profile(axes, one.errors(scenarios, column), thresholds, style(one, measured))
+        _profile_axes(axes, thresholds)
         axes.set_xlabel(f"{_LABELS[column]}: threshold", fontsize=11)
         axes.set_ylabel("held, with an error below the threshold (%)", fontsize=10)
     figure.suptitle(
@@ -113,14 +117,22 @@ def profiles_by_scenario(measured: Sequence[Measured], scenarios: Sequence[str])
     """Draw the same of the position error, a panel per scenario."""
     rows = -(-len(scenarios) // _COLUMNS)
     figure = _figure(11.5, 1.2 + 2.6 * rows)
-    panels = list(figure.subplots(rows, _COLUMNS, squeeze=False, sharey=True).flat)
+    panels = list(figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True, sharey=True).flat)
+    errors = {
+        (one.label, scenario): one.errors([scenario], "position_error_mm")
+        for one in measured
+        for scenario in scenarios
+        if one.measured_on([scenario])
+    }
+    thresholds = _thresholds(list(errors.values()))
     for index, (axes, scenario) in enumerate(zip(panels, scenarios, strict=False)):
-        _profiles(
-            axes, [one for one in measured if one.measured_on([scenario])], measured, [scenario], "position_error_mm"
-        )
+        for one in measured:
+            if (one.label, scenario) in errors:
+                _profile(axes, errors[one.label, scenario], thresholds, style(one, measured))
+        _profile_axes(axes, thresholds)
         axes.set_title(scenario, fontsize=11)
         axes.set_xlabel("position error (mm): threshold", fontsize=9)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(labelsize=8, labelbottom=True)
         if index % _COLUMNS == 0:
             axes.set_ylabel("held, with an error\nbelow the threshold (%)", fontsize=9)
     for axes in panels[len(scenarios) :]:
@@ -130,21 +142,25 @@ def profiles_by_scenario(measured: Sequence[Measured], scenarios: Sequence[str])
     return figure
 
 
-def _profiles(
-    axes: Axes, chosen: Sequence[Measured], measured: Sequence[Measured], scenarios: Sequence[str], column: str
-) -> None:
-    errors = {one.label: one.errors(scenarios, column) for one in chosen}
-    finite = np.concatenate([each[np.isfinite(each)] for each in errors.values()] or [np.zeros(0)])
+def _thresholds(errors: Sequence[Floats]) -> Floats:
+    """Return thresholds over the range of all finite errors."""
+    finite = np.concatenate([np.zeros(0), *(each[np.isfinite(each)] for each in errors)])
     low, high = (0.8 * finite.min(), 1.25 * finite.max()) if len(finite) else (0.1, 10.0)
-    thresholds = np.geomspace(low, high, _POINTS)
-    for one in chosen:
-        per_seed = share_above(-errors[one.label][:, None], -thresholds)
-        axes.plot(thresholds, 100 * per_seed.mean(axis=0), linewidth=2.2, **style(one, measured))  # type: ignore[arg-type]
-        if len(per_seed) > 1:
-            band = 100 * bounds(lambda resampled: resampled.mean(axis=-2), per_seed, whole_runs=True)
-            axes.fill_between(thresholds, *band, color=str(style(one, measured)["color"]), alpha=_BAND, linewidth=0)
+    return np.geomspace(low, high, _POINTS)
+
+
+def _profile(axes: Axes, errors: Floats, thresholds: Floats, line: dict[str, object]) -> None:
+    """Draw one line from errors (seeds, episodes), and the interval over the seeds as a band about it."""
+    per_seed = share_above(-errors[:, None], -thresholds)
+    axes.plot(thresholds, 100 * per_seed.mean(axis=0), linewidth=2.2, **line)  # type: ignore[arg-type]
+    if len(per_seed) > 1:
+        low, high = 100 * bounds(lambda resampled: resampled.mean(axis=-2), per_seed, whole_runs=True)
+        axes.fill_between(thresholds, low, high, color=str(line["color"]), alpha=_BAND, linewidth=0)
+
+
+def _profile_axes(axes: Axes, thresholds: Floats) -> None:
     axes.set_xscale("log")
-    axes.set_xlim(low, high)
+    axes.set_xlim(thresholds[0], thresholds[-1])
     _plain_numbers(axes.xaxis)
     axes.set_ylim(-3.0, 103.0)
     _grid(axes)
@@ -214,5 +230,6 @@ def _legend(figure: Figure, chosen: Sequence[Measured], measured: Sequence[Measu
         Line2D([], [], linewidth=2.2, label=_name(one), **style(one, measured))  # type: ignore[arg-type]
         for one in chosen
     ]
-    handles.append(Patch(color=_INK, alpha=_BAND, linewidth=0, label=band))
+    if any(len(one.made) > 1 for one in chosen):
+        handles.append(Patch(color=_INK, alpha=_BAND, linewidth=0, label=band))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)

@@ -11,7 +11,15 @@ from agents.configs import TrainConfig
 from agents.report import three_digits
 from agents.statistics import interquartile_mean, interval
 from agents.study.entries import Entry
-from agents.study.evidence import Measured, OfEpisodes, improvement, mean_kept, mean_until_end, success_rate
+from agents.study.evidence import (
+    Measured,
+    OfEpisodes,
+    improvement,
+    least_separation,
+    mean_kept,
+    mean_until_end,
+    success_rate,
+)
 from agents.study.trainings import as_told
 from magenv.origin import UNKNOWN
 
@@ -32,12 +40,16 @@ def _line(cells: Row) -> str:
 
 
 def by_scenario(measured: Sequence[Measured], scenarios: Sequence[str]) -> list[str]:
-    """Return the tables of success, position and heading error, a row per agent or controller."""
+    """Return the tables of success, errors and separation, a row per agent or controller."""
     lines = ["Success (%):", "", *_spreads(measured, scenarios, success_rate, lambda rate: f"{100 * rate:.0f}")]
     for column, title in COLUMNS.items():
         told = _spreads(measured, scenarios, mean_kept(column), three_digits)
         lines += ["", f"{title[0].upper()}{title[1:]}, mean over the successful episodes:", "", *told]
-    return lines
+    lines += [
+        "",
+        "Least separation of the robots (mm), median over all episodes: who keeps it wide holds by staying away.",
+    ]
+    return [*lines, "", *_spreads(measured, scenarios, least_separation, three_digits)]
 
 
 def _spreads(
