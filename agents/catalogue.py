@@ -16,14 +16,19 @@ _SHIPPED = Path(__file__).parent / "data"
 
 def names() -> list[str]:
     """Return the known names, shipped agents last."""
-    return [*CLASSICAL, *(folder.name for folder in sorted(_SHIPPED.glob("*")) if (folder / CARD).is_file())]
+    return [*CLASSICAL, *shipped()]
+
+
+def shipped() -> list[str]:
+    """Return the names of the agents that ship with the package."""
+    return [folder.name for folder in sorted(_SHIPPED.glob("*")) if (folder / CARD).is_file()]
 
 
 def defaults(n_epm: int, control_hz: float) -> tuple[list[Controller], list[str]]:
     """Return what is compared where no controllers are named, and which shipped agents do not fit the environment."""
     chosen: list[Controller] = [paper_baseline(n_epm, control_hz), tuned_baseline(n_epm, control_hz)]
     unfit = []
-    for name in names()[len(CLASSICAL) :]:
+    for name in shipped():
         try:
             chosen.append(controller(name, n_epm, control_hz))
         except InputError as error:
@@ -43,11 +48,10 @@ def controller(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = 
     """
     if name in CLASSICAL:
         return classical(name, n_epm, control_hz, plant)
-    shipped = _SHIPPED / name
     known = name in names()
     require(
         known or (Path(name) / CARD).is_file(), "controller", f"one of {', '.join(names())} or a model's folder", name
     )
-    agent = Learned(shipped, name) if known else Learned(Path(name), name)
+    agent = Learned(_SHIPPED / name, name) if known else Learned(Path(name), name)
     agent.check(n_epm, control_hz)
     return agent

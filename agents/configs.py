@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from agents.residual import Correction
 from magenv.actions import ActionMode
@@ -196,3 +198,22 @@ class TrainConfig:
     def total_steps(self) -> int:
         """Environment steps of the whole training."""
         return self.steps if self.steps is not None else STEPS[self.algo]
+
+
+def command_of(config: TrainConfig) -> str:
+    """Return the command that trains so."""
+    return shlex.join(["python", "train.py", *_options(config, TrainConfig(), "--")])
+
+
+def _options(config: Any, default: Any, prefix: str) -> Iterator[str]:
+    """Yield the options in which a configuration differs from the default."""
+    for name in (one.name for one in fields(config)):
+        value, usual, option = getattr(config, name), getattr(default, name), prefix + name.replace("_", "-")
+        if value == usual:
+            continue
+        if is_dataclass(value):
+            yield from _options(value, usual, f"{option}.")
+        elif value is True:
+            yield option
+        else:
+            yield from (option, *(map(str, value) if isinstance(value, tuple) else (str(value),)))

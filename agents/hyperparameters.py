@@ -11,14 +11,12 @@ import csv
 import dataclasses
 import io
 import json
-import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.checkpoints import BEST, is_run
-from agents.configs import PPOConfig, SACConfig, TrainConfig
+from agents.configs import PPOConfig, SACConfig, TrainConfig, command_of
 from agents.evaluation import Score
 from agents.folders import new_folder
 from agents.keeper import DivergedError
@@ -223,19 +221,3 @@ def _write(trials: list[Trial], folder: Path) -> None:
     best = best_of(trials)
     if best is not None:
         write_file(folder / BEST_COMMAND, (json.dumps(dataclasses.asdict(best), indent=1) + "\n").encode())
-
-
-def command_of(config: TrainConfig) -> str:
-    """Return the command that trains so."""
-    return shlex.join(["python", "train.py", *_options(config, TrainConfig(), "--")])
-
-
-def _options(config: Any, default: Any, prefix: str) -> Iterator[str]:
-    """Return the options in which a configuration differs from the default."""
-    for field in dataclasses.fields(config):
-        value, usual = getattr(config, field.name), getattr(default, field.name)
-        name = prefix + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(value):
-            yield from _options(value, usual, f"{name}.")
-        elif value != usual:
-            yield from (name, *(map(str, value) if isinstance(value, tuple) else (str(value),)))

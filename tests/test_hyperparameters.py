@@ -20,7 +20,7 @@ from agents import hyperparameters
 from agents.checkpoints import BEST, MODEL, stored_config
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.evaluation import Score
-from agents.hyperparameters import BEST_COMMAND, DEFAULTS, TABLE, command_of, search, suggested
+from agents.hyperparameters import BEST_COMMAND, DEFAULTS, TABLE, search, suggested
 from agents.keeper import DivergedError
 from agents.learning import train
 from agents.store import load_card
@@ -193,15 +193,3 @@ def test_without_optuna_it_is_told_how_to_install_it(make_config: MakeConfig, mo
 def test_an_unsound_configuration_is_refused_before_anything_is_written(make_config: MakeConfig) -> None:
     assert "scenario" in refusal(lambda: search(make_config(tune=True, scenario="nowhere")))
     assert not make_config().out.exists()
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        TrainConfig(),
-        TrainConfig(algo="sac", plant="arm:latency_s=0.05,mismatch=0", n_epm=3, seed=7, control_hz=10.0, steps=5),
-        TrainConfig(out=Path("a folder/it's"), ppo=PPOConfig(net=(64,), learning_rate=1e-5, log_std_init=-1e-5)),
-    ],
-)
-def test_a_command_trains_what_it_was_made_from(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert parsed(command_of(config), monkeypatch) == config
