@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: two threads on two cores spin
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: two threads on two cores spin
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends the process without a word
 
 from dataclasses import dataclass

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.configs import PPOConfig, SACConfig, TrainConfig
-from agents.learned import load_weights
+from agents.evaluation import Score
+from agents.networks import flatten, load_weights, unflatten_like
 from agents.store import (
+    CARD,
     Card,
     Normalisation,
-    flatten,
+    check_replaceable,
     load_card,
     load_policy,
     load_training,
+    recover,
     save,
-    unflatten_like,
 )
 from magenv.params import InputError, require
 
 _OPTIMISERS = {"ppo": ("policy.optimizer",), "sac": ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")}
+
+MODEL, BEST = "model", "best"
+"""Folders in that of a run: the last policy, and the best on the held-out episodes."""
 
 GOING_ON = ("steps", "out", "resume", "checkpoint_every")
 """What may be changed when a run is gone on with."""
@@ -49,17 +56,23 @@ def _attribute(model: BaseAlgorithm, path: str) -> Any:
 
 
 def save_model(
-    folder: Path, model: BaseAlgorithm, env: VecNormalize, config: TrainConfig, with_training: bool, command: str
+    folder: Path,
+    model: BaseAlgorithm,
+    env: VecNormalize,
+    config: TrainConfig,
+    with_training: bool,
+    command: str,
+    score: Score | None = None,
 ) -> None:
     """Write the agent as it is now (see ``agents.store``), with its optimisers where asked."""
     own = config.ppo if config.algo == "ppo" else config.sac
-    card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config)
+    card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config.resolved)
     statistics: Any = env.obs_rms
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
-        dataclasses.replace(card, command=command),
-        model.policy.state_dict(),
+        dataclasses.replace(card, command=command, score=score, residual=config.correction),
+        flatten(dict(model.policy.state_dict())),
         Normalisation(statistics.mean, statistics.var, statistics.count),
         training,
     )
@@ -92,7 +105,7 @@ def restore(folder: Path, model: BaseAlgorithm, env: VecNormalize, algo: str) ->
     model.num_timesteps = load_card(folder).steps
 
 
-def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.Tensor]) -> dict[str, Any]:
+def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Return an optimiser's state dictionary from its flattened form, checked against the parameters it is for."""
     groups = unflatten_like(optimiser.state_dict()["param_groups"], stored, "param_groups")
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
@@ -104,13 +117,35 @@ def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, torch.T
             require(known, "checkpoint", "of optimisers of this model", key)
             shape = parameters[int(part[1])].shape if part[2] != "step" else torch.Size()
             require(value.shape == shape, f"checkpoint's {key}", f"of shape {tuple(shape)}", tuple(value.shape))
-            state.setdefault(int(part[1]), {})[part[2]] = value
+            state.setdefault(int(part[1]), {})[part[2]] = torch.from_numpy(value)
     return {"state": state, "param_groups": groups}
 
 
 def checkpoints(run: Path) -> list[Path]:
     """Return the run's checkpoints, oldest first."""
     return sorted(path for path in (Path(run) / "checkpoints").glob("step-*") if path.name[5:].isdigit())
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder holds a run: one that has come to its first checkpoint."""
+    return bool(checkpoints(folder)) or (folder / MODEL).exists()
+
+
+def best_so_far(config: TrainConfig) -> Score | None:
+    """Return the score of the run's best model so far, which stands in the run's folder from now on; None without one.
+
+    That of a run gone on with elsewhere is copied. What stands in a new run's folder was left by one that was killed
+    before its first checkpoint, and is dropped.
+    """
+    best, resume = config.folder / BEST, config.resume
+    recover(best)
+    check_replaceable(best)
+    if resume is None or resume.resolve() != config.folder.resolve():
+        if best.exists():
+            shutil.rmtree(best)
+        if resume is not None and (resume / BEST / CARD).is_file():
+            save(best, load_card(resume / BEST), *load_policy(resume / BEST))
+    return load_card(best).score if best.exists() else None
 
 
 def stored_config(run: Path) -> TrainConfig:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from agents.residual import Correction
 from magenv.actions import ActionMode
 from magenv.episodes import Settings
 from magenv.params import require
@@ -118,25 +121,35 @@ class TrainConfig:
     """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
-    action: ActionMode = "home"
-    """What an action means: home, pose, step, wrench or velocity."""
+    action: ActionMode | None = None
+    """What an action means: home, pose, step, wrench or velocity; by default home, or as of the controller of
+    --residual."""
     observation: ObservationMode = "full"
     """What the agent sees: full or errors."""
     frame: Frame = "robots"
     """Frame of the observation: robots or global."""
     control_hz: float = 2.0
     """Control rate."""
+    residual: str | None = None
+    """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
+    residual_scale: float = 0.1
+    """How far the policy may correct it, of the bounds of an action: above 0, at most 1."""
     steps: int | None = None
     """Environment steps; by default 3 million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None
-    """Folder for model, checkpoints, progress.csv and report; by default runs/train (runs/train-2, ... where it holds a
-    run), or that of --resume."""
+    """Folder for models, checkpoints, progress.csv and report; by default runs/train (runs/train-2, ... where it holds
+    a run), that of --resume, or with --tune runs/tune."""
     resume: Path | None = None
     """Folder of a run to go on with, as it was configured; --steps, --out and --checkpoint-every may change."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints; by default a tenth of all, at most 250,000."""
+    """Steps between checkpoints, at each of which the policy is judged on held-out episodes; by default a tenth of all,
+    at most 250,000."""
+    tune: bool = False
+    """Search for hyperparameters of the algorithm instead, by trials with a tenth of the steps; needs Optuna."""
+    trials: int | None = None
+    """Trials of --tune; by default 20."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 
@@ -147,6 +160,16 @@ class TrainConfig:
         _whole(0, 2**32 - 1, seed=self.seed)
         if self.checkpoint_every is not None:
             _whole(1, math.inf, checkpoint_every=self.checkpoint_every)
+        require(not self.tune or self.resume is None, "tune", "given without --resume", str(self.resume))
+        if self.trials is not None:
+            require(self.tune, "trials", "given with --tune", self.trials)
+            _whole(1, math.inf, trials=self.trials)
+        _ = self.correction  # which checks what it is made of
+
+    @property
+    def correction(self) -> Correction | None:
+        """What the policy corrects; None where it acts by itself."""
+        return None if self.residual is None else Correction(self.residual, self.residual_scale)
 
     @property
     def folder(self) -> Path:
@@ -156,11 +179,15 @@ class TrainConfig:
         return folder
 
     @property
+    def resolved(self) -> TrainConfig:
+        """The same training with its action mode told, whichever it is by default."""
+        return replace(self, action=self.settings.action)
+
+    @property
     def settings(self) -> Settings:
         """The environment."""
-        return Settings(
-            self.scenario, self.plant, self.n_epm, self.action, self.observation, self.frame, self.control_hz
-        )
+        action = self.action or ("home" if self.correction is None else self.correction.action)
+        return Settings(self.scenario, self.plant, self.n_epm, action, self.observation, self.frame, self.control_hz)
 
     @property
     def checkpoint_steps(self) -> int:
@@ -171,3 +198,22 @@ class TrainConfig:
     def total_steps(self) -> int:
         """Environment steps of the whole training."""
         return self.steps if self.steps is not None else STEPS[self.algo]
+
+
+def command_of(config: TrainConfig) -> str:
+    """Return the command that trains so."""
+    return shlex.join(["python", "train.py", *_options(config, TrainConfig(), "--")])
+
+
+def _options(config: Any, default: Any, prefix: str) -> Iterator[str]:
+    """Yield the options in which a configuration differs from the default."""
+    for name in (one.name for one in fields(config)):
+        value, usual, option = getattr(config, name), getattr(default, name), prefix + name.replace("_", "-")
+        if value == usual:
+            continue
+        if is_dataclass(value):
+            yield from _options(value, usual, f"{option}.")
+        elif value is True:
+            yield option
+        else:
+            yield from (option, *(map(str, value) if isinstance(value, tuple) else (str(value),)))

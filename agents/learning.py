@@ -1,31 +1,32 @@
 """Training: build an agent, train it, go on from a checkpoint.
 
 A run's folder holds ``progress.csv`` (and TensorBoard events where it is installed), ``checkpoints/step-...`` (the
-last two) and, at the end, ``model``.
+last two), ``best`` (the policy that was best on held-out episodes) and, at the end, ``model`` (the last one).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from agents.checkpoints import check_goes_on, checkpoints, restore, save_model
+from agents.checkpoints import MODEL, check_goes_on, is_run, restore
 from agents.configs import PPOConfig, SACConfig, TrainConfig
-from agents.learned import CLIP_OBSERVATION, policy_kwargs
+from agents.folders import lock_folder, new_folder
+from agents.keeper import Keeper, Watch
+from agents.networks import policy_kwargs
+from agents.player import CLIP_OBSERVATION
 from agents.progress import Reporter, logger
+from agents.residual_vec import ResidualVecEnv
 from agents.sb3_vec import TwoRobotsVecEnv
-from agents.store import check_replaceable
-from magenv.files import check_output_dir
+from agents.store import check_replaceable, recover
 from magenv.params import InputError
 
 DEFAULT_FOLDER = Path("runs/train")
@@ -39,9 +40,10 @@ def _falling(start: float) -> Any:
 def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
     """Return the untrained agent and its normalised environments."""
     own = config.ppo if config.algo == "ppo" else config.sac
-    env = VecNormalize(
-        TwoRobotsVecEnv(own.n_envs, config.settings, config.seed), norm_reward=False, clip_obs=CLIP_OBSERVATION
-    )
+    robots: VecEnv = TwoRobotsVecEnv(own.n_envs, config.settings, config.seed)
+    if config.correction is not None:
+        robots = ResidualVecEnv(robots, config.correction.base(config.settings), config.correction.scale)
+    env = VecNormalize(robots, norm_reward=False, clip_obs=CLIP_OBSERVATION)
     kwargs = policy_kwargs(config.algo, own.net)
     if isinstance(own, PPOConfig):
         kwargs["log_std_init"] = own.log_std_init
@@ -93,48 +95,7 @@ class _Refill(BaseCallback):
         return True
 
 
-def _lock(folder: Path) -> FileLock | None:
-    """Return the lock of a run's folder, held from now on; None where another training holds it.
-
-    The system frees it when the process ends, however it does.
-    """
-    check_output_dir(folder)
-    lock = FileLock(folder / ".lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        return None
-    return lock
-
-
-def _claim(folder: Path) -> FileLock | None:
-    """Return the lock of a new run's folder; None where it is another run's, begun even at this very moment."""
-    lock = _lock(folder)
-    if lock is not None and (checkpoints(folder) or (folder / "model").exists()):
-        lock.release()
-        return None
-    return lock
-
-
-def _new_run(config: TrainConfig) -> tuple[TrainConfig, FileLock]:
-    """Return the configuration with the folder of a new run: ``out``, or the first of the default's names still free.
-
-    Raises
-    ------
-    InputError
-        If ``out`` holds a run or cannot be written.
-    """
-    names = (DEFAULT_FOLDER.with_name(f"{DEFAULT_FOLDER.name}-{k}") for k in itertools.count(2))
-    for folder in itertools.chain([DEFAULT_FOLDER], names) if config.out is None else [config.out]:
-        lock = _claim(folder)
-        if lock is not None:
-            return dataclasses.replace(config, out=folder), lock
-    raise InputError(
-        f"Input out must be a folder without a run (to go on with one: resume); instead received {str(config.out)!r}."
-    )
-
-
-def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
+def train(config: TrainConfig, command: str = "", watch: Watch | None = None) -> tuple[Path, bool]:
     """Train as configured; return the run's folder and whether the training ran to its end.
 
     Ctrl-C ends it early: model and checkpoint are written all the same, unless nothing was learned yet.
@@ -145,11 +106,15 @@ def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
         To go on with a run: ``agents.checkpoints.stored_config`` of its folder, with more steps.
     command : str
         Kept in the model's card.
+    watch : callable, optional
+        Is told the score on the held-out episodes at every checkpoint; what it raises ends the training.
 
     Raises
     ------
     InputError
         If the configuration, or the run to go on with, is unsound, ``out`` holds a run, or the run is in training.
+    DivergedError
+        If numbers are no longer finite; what was stored before stays.
     KeyboardInterrupt
         If Ctrl-C came before the first step.
     """
@@ -159,40 +124,48 @@ def train(config: TrainConfig, command: str = "") -> tuple[Path, bool]:
         check_goes_on(config)
     model, env = build(config)
     if new:
-        config, lock = _new_run(config)
+        must_be = "a folder without a run (to go on with one: resume)"
+        folder, lock = new_folder(config.out, DEFAULT_FOLDER, is_run, must_be)
+        config = dataclasses.replace(config, out=folder)
     else:
-        held = _lock(config.folder)
+        held = lock_folder(config.folder)
         if held is None:
             raise InputError(f"Input resume must be a run at rest; instead received {config.resume}, in training now.")
         lock = held
     try:
-        return config.folder, _learn(config, model, env, command)
+        return config.folder, _learn(config, model, env, command, watch)
     finally:
         env.close()
         lock.release()
 
 
-def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command: str) -> bool:
+def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command: str, watch: Watch | None) -> bool:
     """Train in the run's folder, which is ours alone; return whether the training ran to its end."""
-    callbacks: list[BaseCallback] = [progress := Reporter(model, config, env, command)]
+    callbacks: list[BaseCallback] = []
     if config.resume is not None:
         restore(check_goes_on(config), model, env, config.algo)
         # Not the first run's episodes again.
         env.seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
         if isinstance(model, SAC):
             callbacks.append(_Refill(config.sac))
-    check_replaceable(config.folder / "model")
+    recover(config.folder / MODEL)
+    check_replaceable(config.folder / MODEL)
+    keeper = Keeper(model, config, env, command, watch)
+    callbacks += [keeper, progress := Reporter(model, config, keeper)]
     begun, finished = model.num_timesteps, True
     model.set_logger(logger(config, begun))
     try:
-        interval = 1 if config.algo == "ppo" else 50
-        model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
-    except KeyboardInterrupt:
-        finished = False
-        if model.num_timesteps == begun:
+        try:
+            interval = 1 if config.algo == "ppo" else 50
+            model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
+        except KeyboardInterrupt:
+            finished = False
+            if model.num_timesteps == begun:
+                raise
+        except ValueError:  # torch and the environment refuse what is not finite
+            keeper.check()
             raise
+        keeper.finish()
     finally:
         progress.close()
-    progress.checkpoint()
-    save_model(config.folder / "model", model, env, config, False, command)
     return finished

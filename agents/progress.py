@@ -1,10 +1,9 @@
-"""What a training tells while it runs: progress bar, progress.csv, checkpoints."""
+"""What a training tells while it runs: progress bar, progress.csv."""
 
 from __future__ import annotations
 
 import csv
 import math
-import shutil
 import sys
 from collections import deque
 from typing import Any
@@ -15,27 +14,24 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
-from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.checkpoints import checkpoints, save_model
 from agents.configs import TrainConfig
+from agents.keeper import Keeper
 
-KEPT_CHECKPOINTS = 2
 _RECENT_EPISODES = 200
 
 
 class Reporter(BaseCallback):
-    """Progress bar with time left, training statistics, checkpoints."""
+    """Progress bar with time left, training statistics."""
 
-    def __init__(self, model: BaseAlgorithm, config: TrainConfig, env: VecNormalize, command: str) -> None:
+    def __init__(self, model: BaseAlgorithm, config: TrainConfig, keeper: Keeper) -> None:
         super().__init__()
         self.model = model
-        self._config, self._env, self._command = config, env, command
+        self._config, self._keeper = config, keeper
         self._episodes: deque[dict[str, Any]] = deque(maxlen=_RECENT_EPISODES)
-        self._next_checkpoint = 0
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=None),  # it gives way to the words
             MofNCompleteColumn(),
             TextColumn("{task.fields[told]}"),
             TimeElapsedColumn(),
@@ -46,46 +42,34 @@ class Reporter(BaseCallback):
         )
 
     def _on_training_start(self) -> None:
-        every = self._config.checkpoint_steps
-        self._next_checkpoint = (self.num_timesteps // every + 1) * every
         self._bar.start()
         self._task = self._bar.add_task(self._config.algo, total=self._config.total_steps, told="")
 
     def _on_step(self) -> bool:
         self._episodes.extend(info for info in self.locals["infos"] if "is_success" in info)
         self._bar.update(self._task, completed=self.num_timesteps, told=self._record())
-        if self.num_timesteps >= self._next_checkpoint:
-            self._next_checkpoint += self._config.checkpoint_steps
-            self.checkpoint()
         return True
 
     def _record(self) -> str:
-        """Log the means of the last episodes, and return them for the bar."""
+        """Log the means of the last episodes; return what the bar tells of them and of the held-out ones."""
+        score = self._keeper.score
         if not self._episodes:
-            return ""
+            return "" if score is None else f"held out {score}"
         keys = ("is_success", "position_error_m", "heading_error_rad")
         success, position, heading = (float(np.mean([episode[key] for episode in self._episodes])) for key in keys)
         self.logger.record("episodes/success_rate", success)
         self.logger.record("episodes/position_error_mm", 1e3 * position)
         self.logger.record("episodes/heading_error_deg", math.degrees(heading))
-        return f"success {success:.0%}  {1e3 * position:.1f} mm  {math.degrees(heading):.1f} deg"
-
-    def _on_training_end(self) -> None:
-        self._bar.stop()
-
-    def checkpoint(self) -> None:
-        """Write a checkpoint; drop all but the run's last two, and what was left half written."""
-        folder = self._config.folder / "checkpoints" / f"step-{self.num_timesteps:012d}"
-        save_model(folder, self.model, self._env, self._config, True, self._command)
-        kept = checkpoints(self._config.folder)[-KEPT_CHECKPOINTS:]
-        for other in folder.parent.iterdir():
-            if other.is_dir() and other.name.startswith("step-") and other not in kept:
-                shutil.rmtree(other)
+        if score is not None:  # all would not go into a line
+            return f"{success:.0%}, held out {score}"
+        return f"success {success:.0%} {1e3 * position:.1f} mm {math.degrees(heading):.1f} deg"
 
     def close(self) -> None:
         """Stop drawing the bar, tell the logs where the training ended."""
+        told = self._record()
+        if self._bar.tasks:  # none where it ended before it began
+            self._bar.update(self._task, told=told)
         self._bar.stop()
-        self._record()
         self.logger.record("time/total_timesteps", self.model.num_timesteps)
         self.logger.dump(self.model.num_timesteps)
         self.logger.close()
@@ -100,7 +84,8 @@ def logger(config: TrainConfig, begun: int) -> Logger:
     rows: list[dict[str, Any]] = []
     if past is not None and past.is_file():
         with past.open(newline="") as file:
-            whole = [row for row in csv.DictReader(file) if None not in row]  # None: what is beyond the columns
+            # None: what is beyond the columns, or what a row lacks.
+            whole = [row for row in csv.DictReader(file) if None not in row and None not in row.values()]
         read = [{key: _number(value) for key, value in row.items() if value} for row in whole]
         rows = [row for row in read if _steps(row) <= begun]  # what came after the checkpoint is trained anew
     logger = configure(str(config.folder), _log_formats())

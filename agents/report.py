@@ -81,7 +81,7 @@ def write_summary(records: list[Record], folder: Path) -> list[Summary]:
         for controller, episodes in by_controller(of_scenario).items():
             written.append(f"{file_name(controller)}_{scenario}.npz")
             save(episodes, folder / "records" / written[-1])
-    _drop_others(folder / "records", ["*_*.npz"], written)
+    drop_others(folder / "records", ["*_*.npz"], written)
     return rows
 
 
@@ -94,7 +94,7 @@ def as_csv(episodes: Iterable[Mapping[str, object]]) -> bytes:
     return table.getvalue().encode()
 
 
-def _drop_others(folder: Path, patterns: list[str], written: list[str]) -> None:
+def drop_others(folder: Path, patterns: list[str], written: list[str]) -> None:
     """Remove what an earlier report left in the folder and this one did not write anew."""
     for path in (path for pattern in patterns for path in folder.glob(pattern)):
         if path.name not in written:
@@ -152,7 +152,7 @@ def write_report(records: list[Record], folder: Path, command: str) -> list[Summ
         write_file(folder / f"replay-{scenario}.gif", animate(of_scenario))
         page += ["", f"![One episode under several controllers](replay-{scenario}.gif)"]
         written += [*pictures, f"replay-{scenario}.gif"]
-    _drop_others(folder, ["paths-*.png", "errors-*.png", "separation-*.png", "replay-*.gif"], written)
+    drop_others(folder, ["paths-*.png", "errors-*.png", "separation-*.png", "replay-*.gif"], written)
     page += ["", "## What the numbers mean", "", _MEANING, "", "## Versions", ""]
     page += [", ".join(f"{name} {number}" for name, number in versions().items())]
     write_file(folder / "report.md", ("\n".join(page) + "\n").encode())
@@ -210,10 +210,11 @@ def _estimate(value: float | None, interval: Interval | None) -> tuple[str, str]
     """Return three significant digits and the interval; a dash where there is nothing."""
     if value is None or interval is None:
         return "-", ""
-    return _three_digits(value), f"{_three_digits(interval[0])}\N{EN DASH}{_three_digits(interval[1])}"
+    return three_digits(value), f"{three_digits(interval[0])}\N{EN DASH}{three_digits(interval[1])}"
 
 
-def _three_digits(value: float) -> str:
+def three_digits(value: float) -> str:
+    """Return a number to three significant digits."""
     return f"{value:#.3g}".rstrip(".")
 
 

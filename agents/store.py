@@ -2,7 +2,7 @@
 
 ``card.json`` tells what the policy needs to be built and is bound to (algorithm, networks, environment, versions);
 ``policy.safetensors`` holds its weights and the observation statistics; ``training.safetensors``, beside them in
-checkpoints, the optimisers.
+checkpoints, the optimisers. All are arrays here: a model is read and played without torch.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from agents.configs import check_net
+from agents.evaluation import Score
+from agents.residual import Correction
 from magenv.episodes import Settings
 from magenv.params import InputError, require
 
@@ -31,6 +33,10 @@ FORMAT = "magenv model 1"
 CARD, POLICY, TRAINING = "card.json", "policy.safetensors", "training.safetensors"
 _PACKAGES = ("magenv", "numpy", "numba", "gymnasium", "stable-baselines3", "torch")
 _MEAN, _VARIANCE, _COUNT = "observation.mean", "observation.variance", "observation.count"
+_DTYPES = ("F32", "F64")
+"""Of all that is stored."""
+
+Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,10 @@ class Card:
     """Of the packages that made it."""
     command: str = ""
     """Command that made it."""
+    score: Score | None = None
+    """On the held-out episodes of its training; None where it was not judged, as before there were any."""
+    residual: Correction | None = None
+    """What the policy corrects; None where it acts by itself."""
 
     @classmethod
     def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
@@ -67,6 +77,10 @@ class Normalisation:
     count: float
 
 
+class NotFiniteError(InputError):
+    """Tensors to be stored that are not finite."""
+
+
 def check_replaceable(folder: Path) -> None:
     """Raise ``ValueError`` where something stands in the place of a model's folder that is no model."""
     foreign = folder.exists() and not (folder / CARD).is_file()
@@ -76,24 +90,33 @@ def check_replaceable(folder: Path) -> None:
 def save(
     folder: Path,
     card: Card,
-    policy: Mapping[str, torch.Tensor],
+    policy: Mapping[str, NDArray[Any]],
     normalisation: Normalisation,
-    training: Mapping[str, torch.Tensor] | None = None,
+    training: Mapping[str, NDArray[Any]] | None = None,
 ) -> None:
-    """Write a model folder whole or not at all; a folder that stood there is replaced."""
+    """Write a model folder whole or not at all; a folder that stood there is replaced.
+
+    Raises
+    ------
+    ValueError
+        If something else stands there.
+    NotFiniteError
+        If a tensor is not finite; nothing has been written then.
+    """
     check_replaceable(folder)
+    numbers = (normalisation.mean, normalisation.variance, *policy.values(), *(training or {}).values())
+    if not all(bool(np.isfinite(value).all()) for value in numbers):
+        raise NotFiniteError(f"Input model must be of finite numbers to be stored; instead received {str(folder)!r}.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"
         new.mkdir()
         (new / CARD).write_text(json.dumps({"format": FORMAT} | dataclasses.asdict(card), indent=1) + "\n")
-        tensors = {f"policy.{name}": value.detach().cpu().contiguous() for name, value in policy.items()}
-        tensors[_MEAN] = torch.from_numpy(np.array(normalisation.mean))
-        tensors[_VARIANCE] = torch.from_numpy(np.array(normalisation.variance))
-        tensors[_COUNT] = torch.tensor([normalisation.count], dtype=torch.float64)
-        save_file(tensors, new / POLICY)
+        arrays = {f"policy.{name}": value for name, value in policy.items()}
+        arrays |= {_MEAN: normalisation.mean, _VARIANCE: normalisation.variance}
+        save_file(arrays | {_COUNT: np.array([normalisation.count])}, new / POLICY)
         if training is not None:
-            save_file({name: value.detach().cpu().contiguous() for name, value in training.items()}, new / TRAINING)
+            save_file(dict(training), new / TRAINING)
         try:
             if folder.exists():
                 os.replace(folder, old)
@@ -104,13 +127,24 @@ def save(
             raise
 
 
+def recover(folder: Path) -> None:
+    """Finish or drop what a process killed within ``save`` left beside a model's folder; nobody may be writing it."""
+    for scratch in folder.parent.glob(f"{folder.name}.*"):
+        left = {path.name for path in scratch.iterdir()} if scratch.is_dir() else {"a file"}
+        if left <= {"new", "old"}:
+            if "old" in left and not folder.exists():  # killed between the two moves: the new one is whole
+                os.replace(scratch / "new", folder)
+            shutil.rmtree(scratch)
+
+
 def load_card(folder: Path) -> Card:
     """Read and check a model's card.
 
     Raises
     ------
     ValueError
-        If the folder holds no magenv model or the card is damaged.
+        If the folder holds no magenv model, the card is damaged or contradicts itself, or another major version of
+        magenv made it.
     """
     path = Path(folder) / CARD
     require(path.is_file(), "model", f"a folder with {CARD}", str(folder))
@@ -123,6 +157,10 @@ def load_card(folder: Path) -> Card:
     try:
         raw["settings"] = Settings(**raw["settings"])
         raw["net"] = tuple(raw["net"])
+        if raw.get("score") is not None:
+            raw["score"] = Score(**raw["score"])
+        if raw.get("residual") is not None:
+            raw["residual"] = Correction(**raw["residual"])
         card = Card(**raw)
     except (KeyError, TypeError) as error:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
@@ -135,10 +173,16 @@ def load_card(folder: Path) -> Card:
         ("command", card.command, str),
     ):
         require(isinstance(value, kind), f"model's {name}", f"of type {kind.__name__}", value)
+    made, own = card.versions.get("magenv"), version("magenv")
+    same = isinstance(made, str) and made.split(".")[0] == own.split(".")[0]
+    require(same, "model", f"of the major version of magenv {own}", made)
+    for name, value in dataclasses.asdict(card.settings).items():  # a mode of the same size would go unnoticed
+        trained = card.config.get(name)
+        require(trained in (None, value), f"model's {name}", f"{trained!r}, as in its training", value)
     return card
 
 
-def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
+def load_policy(folder: Path) -> tuple[Arrays, Normalisation]:
     """Read a model's weights and observation statistics.
 
     Raises
@@ -146,65 +190,33 @@ def load_policy(folder: Path) -> tuple[dict[str, torch.Tensor], Normalisation]:
     ValueError
         If the file is missing, is not safetensors, or lacks the statistics.
     """
-    tensors = _load_tensors(Path(folder) / POLICY)
+    arrays = _load(Path(folder) / POLICY)
     for name in (_MEAN, _VARIANCE, _COUNT):
-        require(name in tensors, "model", f"weights with {name}", str(Path(folder) / POLICY))
-    kinds = {name: torch.float64 if name in (_MEAN, _VARIANCE, _COUNT) else torch.float32 for name in tensors}
-    fits = all(value.dtype == kinds[name] for name, value in tensors.items())
+        require(name in arrays, "model", f"weights with {name}", str(Path(folder) / POLICY))
+    kinds = {name: np.float64 if name in (_MEAN, _VARIANCE, _COUNT) else np.float32 for name in arrays}
+    fits = all(value.dtype == kinds[name] for name, value in arrays.items())
     require(fits, "model", "weights in float32 and statistics in float64", str(Path(folder) / POLICY))
-    finite = all(bool(torch.isfinite(value).all()) for value in tensors.values())
+    finite = all(bool(np.isfinite(value).all()) for value in arrays.values())
     require(finite, "model", "finite weights", str(Path(folder) / POLICY))
-    mean, variance, count = (tensors.pop(name).numpy().astype(np.float64) for name in (_MEAN, _VARIANCE, _COUNT))
+    mean, variance, count = (arrays.pop(name) for name in (_MEAN, _VARIANCE, _COUNT))
     sound = bool((variance >= 0).all()) and count.shape == (1,)
     require(sound, "model", "sound observation statistics", str(Path(folder) / POLICY))
-    policy = {name.removeprefix("policy."): value for name, value in tensors.items()}
+    policy = {name.removeprefix("policy."): value for name, value in arrays.items()}
     return policy, Normalisation(mean, variance, float(count[0]))
 
 
-def load_training(folder: Path) -> dict[str, torch.Tensor]:
+def load_training(folder: Path) -> Arrays:
     """Read a checkpoint's optimisers; the errors are those of ``load_policy``."""
-    return _load_tensors(Path(folder) / TRAINING)
+    return _load(Path(folder) / TRAINING)
 
 
-def _load_tensors(path: Path) -> dict[str, torch.Tensor]:
+def _load(path: Path) -> Arrays:
     require(path.is_file(), "model", f"a folder with {path.name}", str(path.parent))
     try:
-        tensors: dict[str, torch.Tensor] = load_file(path)
-    except (SafetensorError, OSError, ValueError) as error:
+        with safe_open(path, framework="np") as file:
+            kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118 (no mapping)
+            for kind in kinds.values():  # of others numpy may know nothing
+                require(kind in _DTYPES, "model", f"safetensors of {' and '.join(_DTYPES)}", f"{path} with {kind}")
+            return {name: file.get_tensor(name) for name in kinds}
+    except (SafetensorError, OSError) as error:
         raise InputError(f"Input model must hold safetensors; instead received {path} ({error}).") from error
-    return tensors
-
-
-def flatten(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
-    """Return all tensors and numbers of nested dictionaries and lists by dotted path."""
-    if isinstance(tree, torch.Tensor):
-        return {prefix: tree}
-    if isinstance(tree, (bool, int, float)):
-        return {prefix: torch.tensor(tree, dtype=torch.float64)}
-    items = tree.items() if isinstance(tree, Mapping) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
-    flat: dict[str, torch.Tensor] = {}
-    for key, value in items:
-        flat |= flatten(value, f"{prefix}.{key}" if prefix else str(key))
-    return flat
-
-
-def unflatten_like(tree: Any, flat: Mapping[str, torch.Tensor], prefix: str = "") -> Any:
-    """Return ``tree`` with its tensors and numbers replaced by those of ``flat``, the rest as it is.
-
-    Raises
-    ------
-    ValueError
-        If one is missing or has another shape.
-    """
-    if isinstance(tree, (torch.Tensor, bool, int, float)):
-        require(prefix in flat, "checkpoint", f"with {prefix}", "a file without it")
-        value = flat[prefix]
-        if isinstance(tree, torch.Tensor):
-            require(value.shape == tree.shape, f"checkpoint {prefix}", f"of shape {tuple(tree.shape)}", value.shape)
-            return value.to(tree.dtype)
-        return type(tree)(value.item())
-    if isinstance(tree, Mapping):
-        return {k: unflatten_like(v, flat, f"{prefix}.{k}" if prefix else str(k)) for k, v in tree.items()}
-    if isinstance(tree, (list, tuple)):
-        return type(tree)(unflatten_like(v, flat, f"{prefix}.{i}" if prefix else str(i)) for i, v in enumerate(tree))
-    return tree

@@ -6,20 +6,11 @@ import os
 import platform
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+
+from magenv.origin import cpu
 
 PACKAGES = ("magenv", "numba", "llvmlite", "numpy", "scipy", "gymnasium", "torch", "stable_baselines3")
 PEERS = ("envpool", "mujoco", "magpylib", "casadi")
-
-
-def cpu() -> str:
-    """Return the processor's name."""
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def versions() -> str:

@@ -15,7 +15,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import agents
-from agents.learned import CLIP_OBSERVATION, load_weights, policy_kwargs
+from agents.networks import load_weights, policy_kwargs
+from agents.player import CLIP_OBSERVATION
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import load_card, load_policy
 from benchmarks.measure import Contestant, Effort, side_by_side

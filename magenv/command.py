@@ -18,8 +18,13 @@ from magenv.params import InputError
 
 Config = TypeVar("Config")
 
+FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+
+
+class RunError(Exception):
+    """What ends a run although its input was sound, and is no fault of the program: told in one line."""
 
 
 def command_line() -> str:
@@ -73,12 +78,15 @@ def _in_plain_words(error: str) -> str:
 
 
 def friendly(main: Callable[[], None]) -> None:
-    """Run ``main``; bad input ends it with one line and exit code 2, Ctrl-C with 130; a fault of ours is raised."""
+    """Run ``main``; bad input ends it with one line and exit code 2, a ``RunError`` so with 1, Ctrl-C with 130.
+
+    A fault of ours is raised.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are born deaf to it
     try:
         main()
-    except (InputError, OSError) as error:
+    except (InputError, OSError, RunError) as error:
         print("error:", *str(error).split(), file=sys.stderr)  # one line
-        sys.exit(BAD_INPUT)
+        sys.exit(FAILED if isinstance(error, RunError) else BAD_INPUT)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

@@ -47,7 +47,9 @@ PREVIEW_SCALE_M = 0.01
 _PER_ERROR, _PER_LENGTH, _PER_PREVIEW = 1.0 / ERROR_SCALE_M, 1.0 / LENGTH_SCALE_M, 1.0 / PREVIEW_SCALE_M
 _BLOCK = 16  # rows told together
 _ROBOTS, _RATES, _SEPARATION, _FRAME, _PREVIEW, _EPMS = 8, 16, 22, 23, 25, 49
-_EPM_SIZE, _ERRORS_SIZE = 7, 8
+_EPM_SIZE = 7
+ERRORS_SIZE = 8
+"""Length of the pose errors, with which an observation begins whatever its mode."""
 
 POSITION_SCALES_M = (0.002, 0.006, 0.020)
 HEADING_SCALES_RAD = (0.04, 0.15, 0.5)
@@ -91,7 +93,7 @@ class Layout:
     @property
     def size(self) -> int:
         """Length of an observation."""
-        return _ERRORS_SIZE if self.mode == "errors" else _EPMS + _EPM_SIZE * self.system.n_epm
+        return ERRORS_SIZE if self.mode == "errors" else _EPMS + _EPM_SIZE * self.system.n_epm
 
     def bounds(self) -> NDArray[np.float32]:
         """Return the largest magnitude of each entry; noisy measurements beyond are clipped."""

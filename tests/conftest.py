@@ -145,7 +145,7 @@ def rollout(monkeypatch: pytest.MonkeyPatch) -> Told:
     """Let a ladder's episodes end as told instead of running them; its pictures, which take time, are empty."""
     from climbs import Told
 
-    from agents import ladder_run, sharing  # which import torch
+    from agents import ladder_run, sharing  # which take their time; most tests do without
 
     instead = Told()
     monkeypatch.setattr(sharing, "run", instead)
@@ -157,7 +157,7 @@ def rollout(monkeypatch: pytest.MonkeyPatch) -> Told:
 @pytest.fixture
 def climbed(rollout: Told) -> Climbed:
     """Climb down a ladder whose episodes end as told."""
-    from agents.catalogue import controller  # which imports torch
+    from agents.catalogue import controller  # which takes its time
     from agents.ladder import Ladder, climb
 
     def climb_down(outcomes: Outcomes | None = None, name: str = "tuned", **setting: Any) -> list[Rung]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +12,12 @@ import numpy as np
 import pytest
 from tiny_runs import Interrupter, MakeConfig, both, going_on, rows_of, steps_of, total_steps
 
-from agents.checkpoints import checkpoints
-from agents.configs import TrainConfig
+from agents.checkpoints import BEST, MODEL, checkpoints
+from agents.configs import PPOConfig, TrainConfig
+from agents.evaluation import HeldOut, Score
 from agents.learned import Learned
 from agents.learning import train
-from agents.store import load_card
+from agents.store import TRAINING, load_card
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -70,69 +70,121 @@ def test_ctrl_c_right_after_a_resume_keeps_what_was_there(
 
 # Killed.
 
+KILLED_PPO = PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=1, net=(8,))
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from safetensors.torch import save_file
 import agents.store
 from agents.configs import PPOConfig, TrainConfig
+from agents.evaluation import HeldOut, Score
 from agents.learning import train
 
-files = 0
+last, moments, judged = 0, 0, 0
+save_file, replace = agents.store.save_file, os.replace
 
-def killing(tensors, path):
-    global files
-    files += 1
-    save_file(tensors, path)
-    if files == int(sys.argv[2]):
-        os.truncate(path, 100)
+def killed_here():
+    global moments
+    moments += 1
+    if moments == last:
+        print(flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
 
-agents.store.save_file = killing
-ppo = PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net=(16, 16))
-train(TrainConfig(ppo=ppo, steps=512, checkpoint_every=128, out=Path(sys.argv[1])))
+def saving(tensors, path):
+    save_file(tensors, path)
+    os.truncate(path, 100)
+    killed_here()
+    save_file(tensors, path)
+
+def replacing(old, new):
+    killed_here()
+    replace(old, new)
+    if Path(old).name == "new":
+        print(Path(new).name, end=" ", flush=True)
+
+def better(*_):
+    global judged
+    judged += 1
+    return Score(judged / 10, 1.0, 1.0, 1.0)
+
+ppo = PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=1, net=(8,))
+train(TrainConfig(ppo=ppo, steps=128, out=Path(sys.argv[1]) / "0"))  # loads what all need
+agents.store.save_file, os.replace, HeldOut.score = saving, replacing, better
+status = -1
+while status != 0:
+    last += 1
+    child = os.fork()
+    if child == 0:
+        out = Path(sys.argv[1]) / str(last)
+        train(TrainConfig(ppo=ppo, steps=256, checkpoint_every=128, out=out))
+        print(flush=True)
+        os._exit(0)
+    status = os.waitpid(child, 0)[1]
+    assert status in (0, signal.SIGKILL), status
+"""
+"""The same training again and again, each killed one moment later than the one before, until one comes to its end.
+
+Moments are a file of tensors half written, and each move of a file or folder into place or out of the way. Each policy
+is better than the one before. A line tells what of a training had been put in place when it was killed.
 """
 
 
-def train_killed(config: TrainConfig, files: int) -> None:
-    """Train in a process of its own, killed when half of its ``files``-th file of tensors is written."""
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, list[str]]:
+    """Return the folders of trainings killed at every moment, each with what had been put in place, in this order."""
+    folder = tmp_path_factory.mktemp("killed")
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(config.out), str(files)],
+        [sys.executable, "-c", KILLED, str(folder)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         cwd=Path(__file__).parents[1],
         capture_output=True,
+        text=True,
         timeout=120,
         check=False,
     )
-    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    assert done.returncode == 0, done.stderr
+    return {folder / str(k + 1): line.split() for k, line in enumerate(done.stdout.splitlines())}
 
 
-def test_a_run_killed_before_its_first_checkpoint_leaves_its_folder_free(make_config: MakeConfig) -> None:
-    folder = make_config().out
-    train_killed(make_config(), 1)
-    assert not checkpoints(folder)
-    assert train(make_config()) == (folder, True)
-
-
-def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_from_the_one_before(make_config: MakeConfig) -> None:
-    folder = make_config().out
-    train_killed(make_config(), 4)  # the optimisers of the second checkpoint
-    assert steps_of(folder) == [128]
-    Learned(checkpoints(folder)[-1])
-    _, finished = train(going_on(folder))
-    assert finished
-    assert load_card(folder / "model").steps == 512
-    assert total_steps(rows_of(folder))[0] == 128
-    assert all(path.name[5:].isdigit() for path in (folder / "checkpoints").iterdir()), "the half one is left over"
+def test_a_run_killed_at_any_moment_loses_at_most_what_came_after_its_last_checkpoint(
+    killed: dict[Path, list[str]],
+) -> None:
+    first, second = "step-000000000128", "step-000000000256"
+    *_, whole = killed.values()
+    assert whole == ["best", first, "best", second, "best", "model", second]
+    assert len(killed) > 2 * len(whole)
+    for run, stored in killed.items():
+        steps = steps_of(run)
+        # Where a checkpoint takes the place of one after as many steps, that one may be gone, but not the one before.
+        kept = [128 * (k + 1) for k, name in enumerate((first, second)) if name in stored]
+        assert steps == kept or (steps == kept[:-1] and stored[-1] == MODEL)
+        for folder in checkpoints(run):
+            Learned(folder)
+            assert (folder / TRAINING).is_file()
+        if not steps:  # no checkpoint was due yet
+            assert train(TrainConfig(ppo=KILLED_PPO, steps=128, out=run)) == (run, True)
+            continue
+        with pytest.MonkeyPatch.context() as patch:  # no policy is better than those before
+            patch.setattr(HeldOut, "score", lambda *_: Score(0.0, 1.0, 1.0, 0.0))
+            assert train(going_on(run, steps=384)) == (run, True)
+        best = load_card(run / BEST).score
+        assert best is not None
+        assert best.success_rate >= stored.count("best") / 10
+        Learned(run / BEST)
+        assert load_card(run / MODEL).steps == 384
+        assert total_steps(rows_of(run))[0] == 128
+        left = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
+        assert left == {".lock", "best", "checkpoints", "model", "progress.csv"}, "something half done is left over"
+        assert all(path.name[5:].isdigit() for path in (run / "checkpoints").iterdir())
 
 
 def test_after_a_kill_progress_tells_only_what_counts(make_config: MakeConfig) -> None:
     train(make_config())
     shutil.rmtree(checkpoints(make_config().out)[-1])  # as if killed after the last rollout, before its checkpoint
     log = make_config().out / "progress.csv"
-    log.write_text(
-        log.read_text() + "1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24\n"
-    )  # and half written
+    told = log.read_text()
+    columns = len(told.splitlines()[0].split(","))
+    numbers = ",".join(map(str, range(1, columns + 2)))
+    log.write_text(told + numbers + "\n" + numbers[:-6] + "\n")  # damaged, and half written
     train(going_on(make_config().out))
     steps = total_steps(rows_of(make_config().out))
     assert steps == sorted(steps)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import re
+import shutil
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +122,19 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "control_hz a text": lambda card: card["settings"].update(control_hz="2.0"),
     "control_hz null": lambda card: card["settings"].update(control_hz=None),
     "control_hz zero": lambda card: card["settings"].update(control_hz=0.0),
+    "action of its size": lambda card: card["settings"].update(action="pose"),
+    "frame of its size": lambda card: card["settings"].update(frame="global"),
+    "other control_hz": lambda card: card["settings"].update(control_hz=4.0),
+    "no version": lambda card: card.update(versions={}),
+    "other version": lambda card: card["versions"].update(magenv="7.1.0"),
+    "version a number": lambda card: card["versions"].update(magenv=0.1),
+    "residual a text": lambda card: card.update(residual="tuned"),
+    "residual of nobody": lambda card: card.update(residual={"controller": "nobody", "scale": 0.1}),
+    "residual of a list": lambda card: card.update(residual={"controller": ["tuned"], "scale": 0.1}),
+    "residual unscaled": lambda card: card.update(residual={"controller": "idle"}),
+    "residual scale zero": lambda card: card.update(residual={"controller": "idle", "scale": 0.0}),
+    "residual of another action": lambda card: card.update(residual={"controller": "tuned", "scale": 0.1}),
+    "a policy of no residual": lambda card: card.update(residual={"controller": "idle", "scale": 0.1}),
     "control_hz infinite": lambda card: card["settings"].update(control_hz=math.inf),
 }
 
@@ -172,6 +188,27 @@ def test_foreign_weights_are_refused(checkpoint: Path, damage: str) -> None:
     FOREIGN[damage](tensors)
     save_file(tensors, checkpoint / POLICY)
     refusal(lambda: Learned(checkpoint))
+
+
+def test_what_a_policy_is_stored_for_and_what_it_meets_are_both_named(checkpoint: Path, tmp_path: Path) -> None:
+    def told(damage: str, training_told: bool = True) -> str:
+        copy = tmp_path / f"{damage}, {training_told}"
+        shutil.copytree(checkpoint, copy)
+        changed(copy, DAMAGED[damage])
+        if not training_told:
+            changed(copy, lambda card: card.update(config={}))
+        return refusal(lambda: Learned(copy))
+
+    assert "'magenv model 1'; instead received 'magenv model 99'" in told("other format")
+    assert f"magenv {version('magenv')}; instead received '7.1.0'" in told("other version")
+    assert "action must be 'home', as in its training; instead received 'pose'" in told("action of its size")
+    assert "frame must be 'robots', as in its training; instead received 'global'" in told("frame of its size")
+    assert "control_hz must be 2.0, as in its training; instead received 4.0" in told("other control_hz")
+    assert re.search(r"shape \(8, 63\).*\(16, 63\)", told("narrower net"))
+    assert re.search(r"\[63, 6\].*'wrench'.*\[63, 10\]", told("other action", training_told=False))
+    assert re.search(r"\[70, 15\].*n_epm 3.*\[63, 10\]", told("other n_epm", training_told=False))
+    assert re.search(r"\[8, 10\].*'errors'.*\[63, 10\]", told("other observation", training_told=False))
+    assert re.search(r"\[73, 10\].*corrects idle.*\[63, 10\]", told("a policy of no residual"))
 
 
 def test_a_missing_model_is_refused(checkpoint: Path, tmp_path: Path) -> None:

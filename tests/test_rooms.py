@@ -18,6 +18,7 @@ ORDER = [
     "params",
     "files",
     "command",
+    "origin",
     "kernels",
     "arithmetic",
     "angles",
@@ -153,6 +154,26 @@ print(sorted({{name.split(".")[0] for name in sys.modules}} & {{
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.strip() == "[]"
     assert done.stderr == ""
+
+
+def test_torch_is_for_training_alone() -> None:
+    learns = {"torch", "stable_baselines3"}
+    agents = PACKAGE.parent / "agents"
+    found = {
+        ".".join(path.relative_to(agents).with_suffix("").parts)
+        for path in agents.rglob("*.py")
+        if learns & {name.split(".")[0] for name in imports(path)}
+    }
+    assert found == {
+        "networks",
+        "sb3_vec",
+        "residual_vec",
+        "checkpoints",
+        "keeper",
+        "progress",
+        "learning",
+        "study.work",
+    }
 
 
 def test_importing_the_package_registers_the_env_alone() -> None:

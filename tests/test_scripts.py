@@ -133,7 +133,7 @@ def test_evaluate_lists_its_controllers(tmp_path: Path) -> None:
     done = call(tmp_path, "evaluate.py", "--list")
     assert (done.returncode, done.stderr) == (0, "")
     listed = done.stdout.splitlines()
-    assert listed[:6] == ["baseline", "tuned", "predictive", "predictive-robust", "idle", "random"]
+    assert listed[:7] == ["baseline", "tuned", "predictive", "predictive-robust", "steered", "idle", "random"]
     assert len(set(listed)) == len(listed)
     assert not list(tmp_path.iterdir())
 

@@ -1,0 +1,94 @@
+"""The trainings of the study, an entry each, and how their configurations are told as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from agents.checkpoints import GOING_ON
+from agents.configs import STEPS, TrainConfig
+from magenv.params import require
+
+SCENARIOS = ("approach-60", "approach-30", "approach-22.5", "crossing-30", "meeting-30", "eight-30", "still-30")
+"""On which every agent and controller is measured."""
+MAIN = "main"
+"""Group of the agents that stand beside the controllers; all others are compared with those of it."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """One agent of the study."""
+
+    name: str
+    shows: str
+    """What it is there for, in a line."""
+    config: TrainConfig = field(default_factory=TrainConfig)
+    """What differs from the default; seed and folder are the study's."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    group: str = MAIN
+    """``main``, or of which comparison it is a part."""
+    scenarios: tuple[str, ...] = SCENARIOS
+    """Measured on."""
+
+    def of_seed(self, seed: int) -> TrainConfig:
+        """Return the configuration of one of its trainings."""
+        return dataclasses.replace(self.config, seed=seed)
+
+
+TRAININGS = (
+    Training("ppo-home", "PPO as it comes: offsets from the home configuration", seeds=(0, 1, 2, 3, 4)),
+    Training("sac-home", "SAC as it comes", TrainConfig(algo="sac")),
+    Training("ppo-pose", "absolute poses of the EPMs", TrainConfig(action="pose"), group="ablation: action"),
+    Training("ppo-step", "changes of the EPMs' poses", TrainConfig(action="step"), group="ablation: action"),
+    Training(
+        "ppo-wrench", "wrenches that an optimiser allocates", TrainConfig(action="wrench"), group="ablation: action"
+    ),
+    Training("ppo-global", "the global frame", TrainConfig(frame="global"), group="ablation: observation"),
+    Training("ppo-errors", "pose errors alone", TrainConfig(observation="errors"), group="ablation: observation"),
+)
+"""All trainings, in the order of tables; a further one is a further entry."""
+
+
+def names() -> list[str]:
+    """Return the names of all trainings."""
+    return [training.name for training in TRAININGS]
+
+
+def training(name: str) -> Training:
+    """Return the training of this name, or raise ``InputError`` where there is none."""
+    require(name in names(), "name", f"one of the study's trainings ({', '.join(names())})", name)
+    return TRAININGS[names().index(name)]
+
+
+def as_told(config: TrainConfig) -> dict[str, Any]:
+    """Return what counts of a configuration, as JSON holds it: with the algorithm's own hyperparameters alone."""
+    return told_of(json.loads(json.dumps(dataclasses.asdict(config.resolved), default=str)))
+
+
+def told_of(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what counts of a configuration as a model's card holds it, or raise ``InputError`` where it is none."""
+    algo: Any = stored.get("algo")
+    require(algo in STEPS, "algo", " or ".join(STEPS), algo)
+    dropped = (set(GOING_ON) | set(STEPS)) - {algo}
+    return {name: value for name, value in stored.items() if name not in dropped} | {
+        "steps": stored.get("steps") or STEPS[algo]
+    }
+
+
+def check_told(told: Mapping[str, Any], config: TrainConfig, where: str) -> None:
+    """Raise ``InputError`` unless what is told of a configuration is this one.
+
+    What is not told counts as the default: options that came later than a record change nothing of it.
+    """
+    wanted = as_told(config)
+    usual = as_told(TrainConfig(algo=config.algo))
+    for name, value in wanted.items():
+        found = told.get(name, usual[name])
+        if isinstance(value, dict) and isinstance(found, dict):
+            found = usual[name] | found
+        require(found == value, where, f"a training with {name} {value!r}, as the study has it", found)
+    unknown = sorted(set(told) - set(wanted))
+    require(not unknown, where, "a training of options that are known", ", ".join(unknown))
