@@ -54,13 +54,13 @@ class PPOConfig:
     """Samples of a gradient step."""
     n_epochs: int = 6
     """Passes over the samples of an update."""
-    learning_rate: float = 6e-4
+    learning_rate: float = 5e-4
     """At the start; it falls linearly to a tenth."""
     gamma: float = 0.9
     """Discount per control step: what a command does shows within few holds."""
     gae_lambda: float = 0.9
     """Weight of long returns in the advantage."""
-    log_std_init: float = -1.6
+    log_std_init: float = -2.5
     """Logarithm of the policy's standard deviation at the start."""
     net: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of policy and value function."""
@@ -105,7 +105,7 @@ class SACConfig:
         _number(0, 1, gamma=self.gamma)
 
 
-STEPS: dict[Algo, int] = {"ppo": 3_000_000, "sac": 200_000}
+STEPS: dict[Algo, int] = {"ppo": 1_500_000, "sac": 200_000}
 """Environment steps of a training where none are asked for."""
 
 
@@ -122,7 +122,7 @@ class TrainConfig:
     n_epm: int = 2
     """Number of external magnets, 2 or 3."""
     action: ActionMode | None = None
-    """What an action means: home, pose, step, wrench or velocity; by default home, or as of the controller of
+    """What an action means: home, pose, step, wrench or velocity; by default velocity, or as of the controller of
     --residual."""
     observation: ObservationMode = "full"
     """What the agent sees: full or errors."""
@@ -135,7 +135,7 @@ class TrainConfig:
     residual_scale: float = 0.1
     """How far the policy may correct it, of the bounds of an action: above 0, at most 1."""
     steps: int | None = None
-    """Environment steps; by default 3 million (ppo) or 200,000 (sac)."""
+    """Environment steps; by default 1.5 million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None
@@ -186,7 +186,7 @@ class TrainConfig:
     @property
     def settings(self) -> Settings:
         """The environment."""
-        action = self.action or ("home" if self.correction is None else self.correction.action)
+        action = self.action or ("velocity" if self.correction is None else self.correction.action)
         return Settings(self.scenario, self.plant, self.n_epm, action, self.observation, self.frame, self.control_hz)
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agents.checkpoints import GOING_ON
-from agents.configs import STEPS, TrainConfig
+from agents.configs import STEPS, PPOConfig, TrainConfig
 from magenv.params import require
 
 SCENARIOS = ("approach-60", "approach-30", "approach-22.5", "crossing-30", "meeting-30", "eight-30", "still-30")
@@ -38,16 +38,45 @@ class Training:
         return dataclasses.replace(self.config, seed=seed)
 
 
+HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6)
+"""Poses need more room to explore than velocities."""
+
 TRAININGS = (
-    Training("ppo-home", "PPO as it comes: offsets from the home configuration", seeds=(0, 1, 2, 3, 4)),
-    Training("sac-home", "SAC as it comes", TrainConfig(algo="sac")),
-    Training("ppo-pose", "absolute poses of the EPMs", TrainConfig(action="pose"), group="ablation: action"),
-    Training("ppo-step", "changes of the EPMs' poses", TrainConfig(action="step"), group="ablation: action"),
     Training(
-        "ppo-wrench", "wrenches that an optimiser allocates", TrainConfig(action="wrench"), group="ablation: action"
+        "ppo-home",
+        "PPO by offsets from the home configuration",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000),
+    ),
+    Training("sac-home", "SAC by offsets from the home configuration", TrainConfig(algo="sac", action="home")),
+    Training("ppo", "PPO as it comes: velocities of the robots, that steering turns into poses", seeds=(0, 1, 2, 3, 4)),
+    Training("sac", "SAC as it comes", TrainConfig(algo="sac")),
+    Training(
+        "steered-ppo",
+        "PPO that corrects `steered`",
+        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000),
+        seeds=(0, 1, 2, 3, 4),
+    ),
+    Training(
+        "ppo-pose",
+        "absolute poses of the EPMs",
+        TrainConfig(action="pose", ppo=HOME_PPO, steps=3_000_000),
+        group="ablation: action",
+    ),
+    Training(
+        "ppo-step",
+        "changes of the EPMs' poses",
+        TrainConfig(action="step", ppo=HOME_PPO, steps=3_000_000),
+        group="ablation: action",
+    ),
+    Training(
+        "ppo-wrench",
+        "wrenches that an optimiser allocates",
+        TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=1_000_000),
+        group="ablation: action",
     ),
     Training("ppo-global", "the global frame", TrainConfig(frame="global"), group="ablation: observation"),
     Training("ppo-errors", "pose errors alone", TrainConfig(observation="errors"), group="ablation: observation"),
+    Training("ppo-3", "three EPMs", TrainConfig(n_epm=3), group="three EPMs"),
 )
 """All trainings, in the order of tables; a further one is a further entry."""
 
