@@ -48,10 +48,14 @@ TRAININGS = (
         TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000),
     ),
     Training("sac-home", "SAC by offsets from the home configuration", TrainConfig(algo="sac", action="home")),
-    Training("ppo", "PPO as it comes: velocities of the robots, that steering turns into poses", seeds=(0, 1, 2, 3, 4)),
-    Training("sac", "SAC as it comes", TrainConfig(algo="sac")),
     Training(
-        "steered-ppo",
+        "ppo-velocity",
+        "PPO as it comes: velocities of the robots, that steering turns into poses",
+        seeds=(0, 1, 2, 3, 4),
+    ),
+    Training("sac-velocity", "SAC as it comes", TrainConfig(algo="sac")),
+    Training(
+        "residual-steered",
         "PPO that corrects `steered`",
         TrainConfig(residual="steered", residual_scale=0.2, steps=500_000),
         seeds=(0, 1, 2, 3, 4),
@@ -76,7 +80,7 @@ TRAININGS = (
     ),
     Training("ppo-global", "the global frame", TrainConfig(frame="global"), group="ablation: observation"),
     Training("ppo-errors", "pose errors alone", TrainConfig(observation="errors"), group="ablation: observation"),
-    Training("ppo-3", "three EPMs", TrainConfig(n_epm=3), group="three EPMs"),
+    Training("ppo-three", "three EPMs", TrainConfig(n_epm=3), group="three EPMs"),
 )
 """All trainings, in the order of tables; a further one is a further entry."""
 
