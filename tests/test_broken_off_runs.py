@@ -107,7 +107,7 @@ def better(*_):
     return Score(judged / 10, 1.0, 1.0, 1.0)
 
 ppo = PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=1, net=(8,))
-train(TrainConfig(ppo=ppo, steps=128, out=Path(sys.argv[1]) / "0"))  # loads what all need
+train(TrainConfig(action="home", ppo=ppo, steps=128, out=Path(sys.argv[1]) / "0"))  # loads what all need
 agents.store.save_file, os.replace, HeldOut.score = saving, replacing, better
 status = -1
 while status != 0:
@@ -115,7 +115,7 @@ while status != 0:
     child = os.fork()
     if child == 0:
         out = Path(sys.argv[1]) / str(last)
-        train(TrainConfig(ppo=ppo, steps=256, checkpoint_every=128, out=out))
+        train(TrainConfig(action="home", ppo=ppo, steps=256, checkpoint_every=128, out=out))
         print(flush=True)
         os._exit(0)
     status = os.waitpid(child, 0)[1]
@@ -161,7 +161,7 @@ def test_a_run_killed_at_any_moment_loses_at_most_what_came_after_its_last_check
             Learned(folder)
             assert (folder / TRAINING).is_file()
         if not steps:  # no checkpoint was due yet
-            assert train(TrainConfig(ppo=KILLED_PPO, steps=128, out=run)) == (run, True)
+            assert train(TrainConfig(action="home", ppo=KILLED_PPO, steps=128, out=run)) == (run, True)
             continue
         with pytest.MonkeyPatch.context() as patch:  # no policy is better than those before
             patch.setattr(HeldOut, "score", lambda *_: Score(0.0, 1.0, 1.0, 0.0))

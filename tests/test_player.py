@@ -26,7 +26,7 @@ from agents.store import Card, Normalisation, load_policy, save
 from magenv.episodes import Episodes, Settings
 
 ROOT = Path(__file__).parents[1]
-SHIPPED = ROOT / "agents" / "data" / "ppo"
+SHIPPED = ROOT / "agents" / "data" / "home-ppo"
 NETS = [(16, 8), (32,), (8, 8, 12)]
 
 
@@ -99,7 +99,7 @@ def test_the_shipped_agent_acts_as_in_stable_baselines() -> None:
 
 
 def test_a_decision_is_fast() -> None:
-    agent, told, took = controller("ppo"), observations(1), []
+    agent, told, took = controller("home-ppo"), observations(1), []
     for _ in range(200):
         before = time.perf_counter()
         agent.predict(told)
@@ -113,7 +113,7 @@ def test_a_decision_is_fast() -> None:
         """
 from agents.catalogue import controller
 from agents.rollout import run
-assert len(run(controller("ppo"), "approach-60", episodes=1)[0].step_ms) == 200
+assert len(run(controller("home-ppo"), "approach-60", episodes=1)[0].step_ms) == 200
 """,
         """
 import runpy

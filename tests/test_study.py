@@ -15,7 +15,7 @@ from messages import refusal
 from studied import an_entry
 
 from agents import catalogue
-from agents.configs import PPOConfig, SACConfig, TrainConfig, command_of
+from agents.configs import STEPS, PPOConfig, SACConfig, TrainConfig, command_of
 from agents.study import entries
 from agents.study.trainings import TRAININGS, Training, as_told, check_told, names, told_of, training
 from magenv.command import parse
@@ -55,7 +55,7 @@ def test_an_unknown_training_is_refused_with_the_known_ones() -> None:
 def test_configurations_are_compared_by_what_counts() -> None:
     config = TrainConfig(seed=3)
     card = json.loads(json.dumps(dataclasses.asdict(config.resolved)))
-    for told in (as_told(config), told_of(card), told_of(card | {"steps": 3_000_000, "out": "x", "sac": {}})):
+    for told in (as_told(config), told_of(card), told_of(card | {"steps": STEPS["ppo"], "out": "x", "sac": {}})):
         check_told(told, config, "record")
     without = {name: value for name, value in as_told(config).items() if name != "frame"}
     check_told(without, config, "record")  # as if the option had come later

@@ -21,24 +21,31 @@ MakeConfig = Callable[..., TrainConfig]
 
 OPTIONS = [
     *("--ppo.n-envs", "8", "--ppo.n-steps", "16", "--ppo.batch-size", "64", "--ppo.n-epochs", "1"),
-    *("--ppo.net", "16", "16"),
+    *("--ppo.net", "16", "16", "--action", "home"),
 ]
 """What makes a training tiny on the command line."""
 PPO_CONFIG = TrainConfig(
-    ppo=PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net=(16, 16)), steps=512, checkpoint_every=128
+    action="home",
+    ppo=PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net=(16, 16)),
+    steps=512,
+    checkpoint_every=128,
 )
 """Four rollouts of 128 steps, a checkpoint after each."""
 SAC_CONFIG = TrainConfig(
     algo="sac",
+    action="home",
     sac=SACConfig(n_envs=8, batch_size=32, buffer_size=2000, learning_starts=64, gradient_steps=2, net=(16, 16)),
     steps=320,
     checkpoint_every=160,
 )
 CONFIGS = {"ppo": PPO_CONFIG, "sac": SAC_CONFIG}
 SAVED = {
-    "ppo": TrainConfig(ppo=PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=1, net=(16, 8)), steps=128),
+    "ppo": TrainConfig(
+        action="home", ppo=PPOConfig(n_envs=8, n_steps=16, batch_size=64, n_epochs=1, net=(16, 8)), steps=128
+    ),
     "sac": TrainConfig(
         algo="sac",
+        action="home",
         sac=SACConfig(n_envs=8, batch_size=32, buffer_size=1000, learning_starts=64, gradient_steps=1, net=(16, 8)),
         steps=128,
     ),
