@@ -212,7 +212,7 @@ def test_allocation(changes: dict[str, Any], name: str) -> None:
 
 
 def test_action_mode() -> None:
-    with pytest.raises(ValueError, match=told("action", "one of home, pose, step, wrench", "push")):
+    with pytest.raises(ValueError, match=told("action", "one of home, pose, step, wrench, velocity", "push")):
         Actions("push", System())  # type: ignore[arg-type]
 
 

@@ -20,7 +20,7 @@ from rollouts import MODES, MakeEnv, assert_same_bits, assert_same_rollouts, rol
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import magenv
-from magenv.actions import ActionMode
+from magenv.actions import PLANAR, ActionMode
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, plant_named
 from magenv.task import Frame, ObservationMode
@@ -101,7 +101,7 @@ def test_spaces(make_env: MakeEnv) -> None:
     for n_epm in (2, 3):
         for mode in MODES:
             env = make_env(n_epm=n_epm, action=mode)
-            size = 6 if mode == "wrench" else 5 * n_epm
+            size = 6 if mode in PLANAR else 5 * n_epm
             assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
             assert env.observation_space.dtype == np.float32
             assert env.observation_space.is_bounded()
