@@ -82,10 +82,10 @@ class Keeper(BaseCallback):
         """Raise ``DivergedError`` unless parameters, losses and the actions for the last observations are finite."""
         parameters = torch.nn.utils.parameters_to_vector(self.model.policy.parameters())
         if not bool(torch.isfinite(parameters).all()):
-            raise self._diverged("parameters are not finite")
+            raise self.diverged("parameters are not finite")
         losses = [value for name, value in self.logger.name_to_value.items() if name.endswith("loss")]
         if not all(math.isfinite(value) for value in losses):
-            raise self._diverged("the loss is not finite")
+            raise self.diverged("the loss is not finite")
         last = self.model._last_obs
         if isinstance(last, np.ndarray):
             self._mode(last)
@@ -95,12 +95,13 @@ class Keeper(BaseCallback):
         try:
             actions, _ = self.model.predict(normalised, deterministic=True)
         except ValueError as error:  # torch refuses to make a distribution of NaN
-            raise self._diverged("actions are not finite") from error
+            raise self.diverged("actions are not finite") from error
         if not np.isfinite(actions).all():
-            raise self._diverged("actions are not finite")
+            raise self.diverged("actions are not finite")
         return actions
 
-    def _diverged(self, what: str) -> DivergedError:
+    def diverged(self, what: str) -> DivergedError:
+        """Return the error that tells what is not finite, and what was kept."""
         found = checkpoints(self._config.folder)
         kept = f"the last good checkpoint is {found[-1]}" if found else "there was no checkpoint yet"
         return DivergedError(
@@ -157,4 +158,4 @@ class Keeper(BaseCallback):
         try:
             save_model(folder, self.model, self._env, self._config, with_training, self._command, self.score)
         except NotFiniteError as error:  # an optimiser's averages, which squares overflow first
-            raise self._diverged("optimisers are not finite") from error
+            raise self.diverged("optimisers are not finite") from error

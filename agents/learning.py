@@ -162,8 +162,10 @@ def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command
             finished = False
             if model.num_timesteps == begun:
                 raise
-        except ValueError:  # torch and the environment refuse what is not finite
+        except ValueError as error:  # torch and the environment refuse what is not finite
             keeper.check()
+            if str(error).startswith("Input action must be finite"):  # drawn by chance: the mode may be cut to bounds
+                raise keeper.diverged("actions are not finite") from error
             raise
         keeper.finish()
     finally:

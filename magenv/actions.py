@@ -224,7 +224,10 @@ class Actions:
         self._starts = np.concatenate([self._home[None], self._home[None], fallback])
         self._scale = 1.0 / component_scales()
         self._period_s = period_s
-        self._steering = Steering.of(system, plant or Plant(), period_s)
+        body = (plant or Plant()).body
+        dragged = min(body.drag_linear_nspm, body.drag_rotational_nmsprad) > 0.0
+        require(dragged or mode != "velocity", "plant", "one with linear and rotational drag in velocity", body)
+        self._steering = Steering.of(system, plant if plant is not None and dragged else Plant(), period_s)
 
     def constants(self) -> dict[str, Any]:
         """Return what the kernels of all modes take that never changes, by the names of ``magenv.state.State``."""

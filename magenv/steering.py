@@ -4,7 +4,8 @@ The hold is foreseen by its linear motion M q'' + D q' = F + K q about where the
 stiffness K that nominal magnets exert on them there: some microseconds, where integrating the plant takes a hundred.
 Of the many poses that serve, those are preferred under which errors grow least until the hold ends, which keep the
 headings stiffly, and whose radii are moderate. Least squares from the present poses (Levenberg-Marquardt); where they
-miss what is wanted, or errors would grow fast, from others too.
+miss what is wanted, or errors would grow fast, from others too. EPMs are taken to be where they are commanded as the
+hold begins, and measured poses to be exact.
 """
 
 from __future__ import annotations
@@ -257,7 +258,6 @@ def foresee(s: Steering, w: Workspace, rates: Floats) -> None:
 def locate(w: Workspace, state: Floats) -> None:
     """Put the robots of ``state`` (12,) into the model."""
     model = w.model
-    load_state(model, state)
     n = len(model.epm_moment)
     for robot in range(2):
         sine, cosine = sincos(state[3 * robot + 2])
@@ -314,7 +314,7 @@ def _weigh(s: Steering, w: Workspace, state: Floats, ahead: Floats, care: float,
         for j in range(COORDINATES):
             w.scaled[i, j] = s.root[i] * model.stiffness[i, j] * s.root[j]
     grown = log_growth(w.scaled, s.substep * s.substeps, w.growth, w.product)
-    out[COORDINATES] = care * max(0.0, grown) / _GROWTH
+    out[COORDINATES] = care * (0.0 if grown < 0.0 else grown) / _GROWTH
     for robot in range(2):
         turn = 3 * robot + 2
         field = -model.stiffness[turn, turn] / model.nominal[n + robot]
@@ -416,8 +416,13 @@ def _descend(
 
 
 @kernel
-def _miss_more(s: Steering, w: Workspace, state: Floats, ahead: Floats, epms: Floats, aim: Floats) -> float:
-    """Aim (6,) by so much aside as the motion itself misses what its linear form hits; return that, squared."""
+def _miss_more(
+    s: Steering, w: Workspace, state: Floats, ahead: Floats, epms: Floats, aim: Floats
+) -> tuple[float, float]:
+    """Write an aim (6,) beside what is wanted by as much as the motion itself differs from its linear form.
+
+    Returns this difference, squared, and the miss of the motion itself, squared.
+    """
     model = w.model
     _exert(s, w, state, epms)
     foresee(s, w, state[COORDINATES:])
@@ -425,15 +430,16 @@ def _miss_more(s: Steering, w: Workspace, state: Floats, ahead: Floats, epms: Fl
     for _ in range(s.substeps):
         go(model)
     read_state(model, w.landed)
-    more = 0.0
+    more, miss = 0.0, 0.0
     for i in range(COORDINATES):
-        turns = i % 3 == 2
+        turns, unit = i % 3 == 2, _HEADING_RAD if i % 3 == 2 else _POSITION_M
         way = w.landed[i] - state[i]
-        beside = (wrap(way) if turns else way) - w.moved[i]
+        way = wrap(way) if turns else way
+        beside = way - w.moved[i]
         aim[i] = ahead[i] - beside
-        more += (beside / (_HEADING_RAD if turns else _POSITION_M)) ** 2
-    load_state(model, state)
-    return more
+        more += (beside / unit) ** 2
+        miss += ((way - ahead[i]) / unit) ** 2
+    return more, miss
 
 
 @kernel
@@ -482,7 +488,8 @@ def steer(
     Returns
     -------
     float
-        In units of 0.1 mm and 3 mrad, squared; NaN or infinite where nothing could be foreseen: poses are as they were.
+        By the nominal plant itself, in units of 0.1 mm and 3 mrad, squared; NaN or infinite where nothing could be
+        foreseen: poses are as they were.
     """
     best, other = epms.copy(), np.empty_like(epms)
     cost, miss, growth = _descend(s, w, state, ahead, 1.0, limits, ITERATIONS, best)
@@ -499,8 +506,8 @@ def steer(
             cost, miss, growth = new_cost, new_miss, new_growth
     aim = np.empty(COORDINATES)
     for _ in range(_CORRECTIONS):
-        if not _miss_more(s, w, state, ahead, best, aim) + miss > _EXACT:
+        if not _miss_more(s, w, state, ahead, best, aim)[0] + miss > _EXACT:
             break
         _, miss, _ = _descend(s, w, state, aim, _POLISH, limits, _CORRECTING, best)
     epms[:] = best
-    return miss
+    return _miss_more(s, w, state, ahead, best, aim)[1]

@@ -56,7 +56,9 @@ class Counting(Idle):
 
 def residual(algo: str = "ppo", controller: str = "tuned", **changes: Any) -> TrainConfig:
     """Return a tiny training of a policy that corrects a controller."""
-    return dataclasses.replace(CONFIGS[algo], **({"residual": controller, "residual_scale": 0.05} | changes))
+    return dataclasses.replace(
+        CONFIGS[algo], **({"action": None, "residual": controller, "residual_scale": 0.05} | changes)
+    )
 
 
 def stored(folder: Path, config: TrainConfig, silent: bool = False) -> Path:

@@ -25,6 +25,7 @@ def test_it_asks_for_the_way_to_the_reference_in_one_hold(control_hz: float) -> 
     errors = observation.reshape(4, 2, 4).astype(np.float64)
     way = action.reshape(4, 2, 3) * np.array([VELOCITY_MPS, VELOCITY_MPS, VELOCITY_RADPS]) / control_hz
     slow = np.abs(action.reshape(4, 2, 3)) < 1.0
+    assert slow.any()
     expected = np.concatenate([0.03 * errors[..., :2], np.arctan2(errors[..., 2:3], errors[..., 3:])], axis=-1)
     np.testing.assert_allclose(way[slow], expected[slow], rtol=1e-5, atol=1e-9)
     np.testing.assert_array_equal(Steered(control_hz).predict(observation[0])[0], action[0])
