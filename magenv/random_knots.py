@@ -14,7 +14,7 @@ from magenv.streams import Keys, normal, uniform
 Floats = NDArray[np.float64]
 
 _AXES = 6  # x, y, heading of both robots
-RANDOM_SEPARATION_M = (0.025, 0.100)
+RANDOM_SEPARATION_M = (0.020, 0.100)
 """Range of the least separation in the random family."""
 _RANDOM_RADIUS_M = 0.082
 RANDOM_EXTENT = _RANDOM_RADIUS_M, RANDOM_SEPARATION_M[0]
