@@ -38,7 +38,7 @@ from magenv.poses import (
 from magenv.reach import EVERYWHERE, Shell, make_allowed, project_within
 from magenv.sensitivity import COORDINATES
 from magenv.solver import best_of, relative_scale
-from magenv.steering import Steering
+from magenv.steering_cost import Steering
 from magenv.velocity import velocity_rows
 from magenv.workers import Workers
 from magenv.wrench import WRENCH_SIZE
@@ -260,7 +260,7 @@ class Actions:
         measured: Floats,
         epms: Floats,
         active: Bools | None = None,
-        before: Floats | None = None,
+        expected: Floats | None = None,
     ) -> tuple[Floats, Bools]:
         """Return the commanded EPMs (n, N, 6) and where the least gap or reach made them differ from the action.
 
@@ -274,22 +274,24 @@ class Actions:
             Present EPMs.
         active : ndarray, shape (n,), optional
             Where a command is wanted; elsewhere the answer is undefined.
-        before : ndarray, shape (n, 2, 3), optional
-            Poses of the robots a control period earlier; by default they are at rest.
+        expected : ndarray, shape (n, 12), optional
+            State in which the last command was to bring the robots (in ``velocity``); by default they are at rest. The
+            state that these commands should lead to is written there.
         """
         active = np.ones(len(epms), np.bool_) if active is None else active
         targets, projected, solver = np.array(epms), np.empty(len(epms), np.bool_), np.zeros(len(epms), np.int64)
         present = np.ascontiguousarray(epms)
         measured = np.ascontiguousarray(measured)
-        before = measured if before is None else np.ascontiguousarray(before)
-        self.command(actions, measured, before, present, active, targets, projected, solver)
+        if expected is None:
+            expected = np.concatenate([measured.reshape(-1, COORDINATES), np.zeros((len(epms), COORDINATES))], axis=1)
+        self.command(actions, measured, expected, present, active, targets, projected, solver)
         return targets, projected
 
     def command(
         self,
         actions: Floats,
         measured: Floats,
-        before: Floats,
+        expected: Floats,
         epms: Floats,
         active: Bools,
         targets: Floats,
@@ -314,7 +316,7 @@ class Actions:
                 active,
                 actions,
                 measured,
-                before,
+                expected,
                 self._period_s,
                 epms,
                 self._steering,

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from magenv.actions import PLANAR, ActionMode, Actions
+from magenv.forecast import STATE
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, POSE_SIZE
 from magenv.random_knots import RANDOM_EXTENT
@@ -167,6 +168,7 @@ class Episodes:
             every=np.ones(n, np.bool_),
             measured=np.zeros((n, 2, 3)),
             before=np.zeros((n, 2, 3)),
+            expected=np.zeros((n, STATE)),
             paid=np.zeros((len(REWARD_TERMS) + 1, n)),
             ended=np.zeros((2, n), np.bool_),
             time=np.zeros(n),

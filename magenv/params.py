@@ -234,6 +234,10 @@ class Plant:
             self.workspace_radius_m,
         )
 
+    def substeps(self, period_s: float) -> int:
+        """Return how many equal substeps make up a period (s): as few as are none longer than ``substep_s``."""
+        return max(1, math.ceil(period_s / self.substep_s - 1e-9))
+
     @property
     def epms_jump(self) -> bool:
         """Whether the EPMs are at once where they are commanded."""

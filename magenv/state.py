@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magenv.kernels import kernel
 from magenv.magnets import Size
-from magenv.steering import Steering
+from magenv.steering_cost import Steering
 from magenv.streams import Keys
 from magenv.travel import Motion
 
@@ -115,6 +115,8 @@ class State(NamedTuple):
     """(n, 2, 3) poses of the robots at this control instant."""
     before: Floats
     """(n, 2, 3) and at the one before."""
+    expected: Floats
+    """(n, 12) state of the robots as the last hold was to bring it about, in ``velocity``; at rest at first."""
     paid: Floats
     """(3, n) reward terms, then the reward."""
     ended: Bools

@@ -18,6 +18,7 @@ from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel, typed
 from magenv.reach import make_allowed
+from magenv.sensitivity import COORDINATES
 from magenv.starts import place_rows
 from magenv.state import State
 from magenv.task import observe_rows, reward_terms
@@ -89,7 +90,7 @@ def _velocity(first: int, last: int, active: Bools, actions: Floats, s: State) -
         active,
         actions,
         s.measured,
-        s.before,
+        s.expected,
         s.period,
         s.epms,
         s.steering,
@@ -211,6 +212,11 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
         if mask[i] and s.uncertain:
             add_noise(measured, i, s.plant_key[i], 0, s.noise_position, s.noise_heading, stream)
             before[i] = measured[i]
+    expected = s.expected
+    for i in range(first, last):
+        if mask[i]:
+            for j in range(COORDINATES):
+                expected[i, j], expected[i, COORDINATES + j] = measured[i, j // 3, j % 3], 0.0
     tell_rows(first, last, mask, s, observations)
 
 

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magenv.angles import sincos, wrap
+from magenv.forecast import STATE
 from magenv.kernels import kernel
 from magenv.outcome import CONVERGED, FELL_BACK, NOT_CONVERGED
 from magenv.poses import robots_frame
 from magenv.sensitivity import COORDINATES
-from magenv.steering import MET, Steering, estimate_rates, locate, steer, workspace
+from magenv.steering import MET, steer
+from magenv.steering_cost import Steering, workspace
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -29,7 +31,7 @@ def velocity_rows(
     active: Bools,
     actions: Floats,
     measured: Floats,
-    before: Floats,
+    expected: Floats,
     period: float,
     epms: Floats,
     steering: Steering,
@@ -40,10 +42,12 @@ def velocity_rows(
 ) -> None:
     """Write the EPMs (n, N, 6) under which robots go with ``actions`` (n, 6), sought from ``epms``, where they are now.
 
-    ``measured`` (n, 2, 3) are the robots' poses, ``before`` those a period earlier. Writes into ``solver`` (n,) how
-    that ended, codes into ``outcome.OUTCOMES``. Where nothing can be foreseen, ``targets`` stay: the last command.
+    ``measured`` (n, 2, 3) are the robots' poses, ``expected`` (n, 12) the states in which the last commands were to
+    leave them. Their rates are taken to be those expected, and more by as much as, over a period, makes up for where
+    they are. The states expected next are written there, and into ``solver`` (n,) how the search ended, codes into
+    ``outcome.OUTCOMES``. Where nothing can be foreseen, ``targets`` stay: the last command.
     """
-    state, ahead, mean = np.empty(2 * COORDINATES), np.empty(COORDINATES), np.empty(COORDINATES)
+    state, ahead = np.empty(STATE), np.empty(COORDINATES)
     room = workspace(steering)
     found = np.empty(epms.shape[1:])
     for i in range(first, last):
@@ -54,18 +58,18 @@ def velocity_rows(
         for robot in range(2):
             at = 3 * robot
             for j in range(3):
-                moved = measured[i, robot, j] - before[i, robot, j]
+                more, rate = measured[i, robot, j] - expected[i, at + j], COORDINATES + at + j
                 state[at + j] = measured[i, robot, j]
-                mean[at + j] = (wrap(moved) if j == 2 else moved) / period
+                state[rate] = expected[i, rate] + (wrap(more) if j == 2 else more) / period
             along, across = VELOCITY_MPS * actions[i, at], VELOCITY_MPS * actions[i, at + 1]
             ahead[at] = period * (cosine * along - sine * across)
             ahead[at + 1] = period * (sine * along + cosine * across)
             ahead[at + 2] = period * VELOCITY_RADPS * actions[i, at + 2]
         found[:] = epms[i]
-        locate(room, state)
-        estimate_rates(steering, room, mean, state, found)
         miss = steer(steering, room, state, ahead, heading, limits, found)
         projected[i] = False  # what is found is within reach
         solver[i] = CONVERGED if miss <= MET else NOT_CONVERGED if miss < math.inf else FELL_BACK
-        if solver[i] != FELL_BACK:
-            targets[i] = found
+        if solver[i] == FELL_BACK:
+            expected[i, :COORDINATES], expected[i, COORDINATES:] = state[:COORDINATES], 0.0
+        else:
+            targets[i], expected[i] = found, room.landed

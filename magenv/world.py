@@ -211,8 +211,7 @@ class World:
         self._plant = plant
         self.physics = Physics.of(system, plant, n)
         self.period_s = task.period_s
-        # As many equal substeps as fit, none longer than the plant's.
-        self.substeps = max(1, math.ceil(task.period_s / plant.substep_s - 1e-9))
+        self.substeps = plant.substeps(task.period_s)
         self._tracking_distance = task.tracking_distance_m
         self._workers = workers or Workers()
         moves = TRAVELLING if not plant.epms_jump else LATE if plant.latency_s > 0.0 else AT_ONCE

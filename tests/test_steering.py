@@ -9,13 +9,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from agents.steered import Steered
 from magenv.actions import Actions
 from magenv.episodes import Episodes, Settings
+from magenv.forecast import STATE
+from magenv.linear_hold import LinearHold, foresee, growth, log_growth
 from magenv.outcome import CONVERGED, FELL_BACK
 from magenv.params import Body, Plant, System
 from magenv.poses import from_cartesian, robots_frame
 from magenv.sensitivity import COORDINATES
-from magenv.steering import Steering, foresee, log_growth, workspace
 from magenv.stiffness import planar_stiffness
 from magenv.velocity import VELOCITY_MPS, VELOCITY_RADPS
 
@@ -51,25 +53,25 @@ def test_growth_is_the_norm_of_the_exponential(rng: np.random.Generator, size: f
     assert grown == pytest.approx(math.log(np.linalg.norm(expm(a * PERIOD_S))), rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize("period", [0.1, 0.5])
+@pytest.mark.parametrize("period", [0.02, 0.1, 0.5, 2.0])
 def test_what_is_foreseen_solves_the_equation_of_motion(rng: np.random.Generator, period: float) -> None:
     """M q'' + D q' = F + K q from rest and from a velocity, against the exponential of the whole linear system."""
-    plant = Plant()
-    s = Steering.of(System(), plant, period)
-    w, body = workspace(s), plant.body
+    body = Plant().body
+    hold = LinearHold.of(body, period)
     inertia = np.tile([body.mass_kg, body.mass_kg, body.inertia_kgm2], 2)
-    half = 0.5 * rng.normal(size=(COORDINATES, COORDINATES)) / s.root / s.root[:, None]  # rates of a few per second
-    w.model.stiffness[:] = half + half.T
-    w.force[:] = rng.normal(size=COORDINATES) * s.drag * 0.01
+    half = 0.5 * rng.normal(size=(COORDINATES, COORDINATES)) / hold.root / hold.root[:, None]  # a few per second
+    stiffness, force = half + half.T, rng.normal(size=COORDINATES) * hold.drag * 0.01
+    moved, then = np.empty((2, COORDINATES))
     for rates in (np.zeros(COORDINATES), rng.normal(size=COORDINATES) * 0.01):
         motion = np.zeros((13, 13))
         motion[:6, 6:12] = np.eye(6)
-        motion[6:12, :6] = w.model.stiffness / inertia[:, None]
-        motion[6:12, 6:12] = np.diag(-s.drag / inertia)
-        motion[6:12, 12] = w.force / inertia
-        exact = (expm(motion * period) @ np.concatenate([np.zeros(6), rates, [1.0]]))[:6]
-        foresee(s, w, rates)
-        np.testing.assert_allclose(w.moved, exact, rtol=0.02, atol=0.01 * np.abs(exact).max())
+        motion[6:12, :6] = stiffness / inertia[:, None]
+        motion[6:12, 6:12] = np.diag(-hold.drag / inertia)
+        motion[6:12, 12] = force / inertia
+        exact = expm(motion * period) @ np.concatenate([np.zeros(6), rates, [1.0]])
+        foresee(hold, hold.substeps, force, stiffness, rates, moved, then)
+        np.testing.assert_allclose(moved, exact[:6], rtol=0.03, atol=0.01 * np.abs(exact[:6]).max())
+        np.testing.assert_allclose(then, exact[6:12], rtol=0.05, atol=0.02 * np.abs(exact[6:12]).max())
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])
@@ -115,7 +117,8 @@ def test_a_hold_is_sought_in_which_errors_grow_little(rng: np.random.Generator) 
     robots, system = apart(rng, 32, 0.045), System()
     actions = Actions("velocity", system)
     epms, _ = actions.to_epms(np.zeros((32, COORDINATES)), robots, actions.home(robots))
-    s = Steering.of(system, Plant(), PERIOD_S)
+    hold = LinearHold.of(Plant().body, PERIOD_S)
+    room = np.empty((3, COORDINATES, COORDINATES))
 
     grown = []
     for robot, epm in zip(robots, epms, strict=True):
@@ -124,19 +127,74 @@ def test_a_hold_is_sought_in_which_errors_grow_little(rng: np.random.Generator) 
         moments[:, 0], moments[:, 1] = np.cos(robot[:, 2]), np.sin(robot[:, 2])
         pose = from_cartesian(epm[:, :3], epm[:, 3:])
         k = planar_stiffness(positions, system.ipm_moment_am2 * moments, pose, system.epm_moment_am2)
-        grown.append(np.linalg.norm(expm(k * s.root * s.root[:, None] * PERIOD_S)))
+        grown.append(np.linalg.norm(expm(k * hold.root * hold.root[:, None] * PERIOD_S)))
+        assert growth(hold, k, *room) == pytest.approx(math.log(grown[-1]), rel=1e-6)
     assert np.median(grown) < 3.0
 
 
 def test_where_nothing_can_be_foreseen_the_last_command_is_held() -> None:
     actions, robots = Actions("velocity", System()), np.zeros((1, 2, 3))  # both in one place
     epms = actions.home(np.array([[[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]]]))
-    held, solver = epms.copy(), np.zeros(1, np.int64)
+    held, solver, expected = 2.0 * epms, np.zeros(1, np.int64), np.full((1, STATE), 0.1)
+    last = held.copy()
     actions.command(
-        np.zeros((1, COORDINATES)), robots, robots, epms, np.ones(1, np.bool_), held, np.zeros(1, np.bool_), solver
+        np.zeros((1, COORDINATES)), robots, expected, epms, np.ones(1, np.bool_), held, np.zeros(1, np.bool_), solver
     )
     assert solver[0] == FELL_BACK
-    np.testing.assert_array_equal(held, epms)
+    np.testing.assert_array_equal(held, last)
+    np.testing.assert_array_equal(expected, np.zeros((1, STATE)))
+
+
+@pytest.mark.parametrize("control_hz", [2.0, 10.0, 50.0])
+def test_the_state_expected_is_the_one_that_comes(rng: np.random.Generator, control_hz: float) -> None:
+    """Rates among it, to rounding, since the plant is the nominal one: robots 30 mm apart, sent here and there."""
+    episodes, everyone = (
+        Episodes(4, Settings("still-30", action="velocity", control_hz=control_hz)),
+        np.ones(4, np.bool_),
+    )
+    for row in range(4):
+        episodes.seed(row, np.random.default_rng(row))
+    episodes.start(everyone)
+    moved = 0.0
+    for _ in range(10):
+        episodes.step(rng.uniform(-0.3, 0.3, (4, COORDINATES)), everyone)
+        there = episodes.state.robots.reshape(4, 2, 2, 3).transpose(0, 2, 1, 3).reshape(4, STATE)
+        np.testing.assert_allclose(episodes.state.expected, there, rtol=1e-9, atol=1e-10)
+        moved = max(moved, float(np.abs(there[:, COORDINATES:]).max()))
+    assert moved > 1e-3
+
+
+def test_more_than_was_expected_counts_as_speed() -> None:
+    """Robots a millimetre farther along than expected half a second after are taken to go 2 mm/s faster."""
+    actions = Actions("velocity", System())
+    robots = np.array([[[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]]])
+    still = np.concatenate([robots.reshape(1, COORDINATES), np.zeros((1, COORDINATES))], axis=1)
+    behind, going = still.copy(), still.copy()
+    behind[0, 1] -= 1e-3
+    going[0, COORDINATES + 1] = 2e-3
+    epms = actions.home(robots)
+    first, _ = actions.to_epms(np.zeros((1, COORDINATES)), robots, epms, expected=behind)
+    second, _ = actions.to_epms(np.zeros((1, COORDINATES)), robots, epms, expected=going)
+    np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(behind, going, rtol=1e-9, atol=1e-12)
+    rest, _ = actions.to_epms(np.zeros((1, COORDINATES)), robots, epms, expected=still)
+    assert np.abs(rest - first).max() > 1e-4
+
+
+@pytest.mark.parametrize("scenario", ["eight-30", "approach-20"])
+def test_robots_are_held_where_errors_grow_a_hundredfold(scenario: str) -> None:
+    """In holds of half a second the calmest grow by some e^6 in ``eight-30``; at 10 Hz 20 mm can be held."""
+    hz = 2.0 if scenario == "eight-30" else 10.0
+    controller = Steered(control_hz=hz)
+    episodes = Episodes(2, Settings(scenario, action="velocity", observation="errors", control_hz=hz))
+    for row in range(2):
+        episodes.seed(row, np.random.default_rng(row))
+    active = np.ones(2, np.bool_)
+    observed = episodes.start(active)
+    for _ in range(round(50.0 * hz)):
+        action, _ = controller.predict(observed)
+        observed = episodes.step(action.astype(np.float64), active)
+        assert not episodes.state.ended[0].any(), episodes.state.time
 
 
 def test_the_miss_told_is_the_plants(rng: np.random.Generator) -> None:
@@ -163,12 +221,3 @@ def test_velocities_need_drag() -> None:
     Actions("home", System(), plant=bare)
     with pytest.raises(ValueError, match="plant must be one with linear and rotational drag in velocity"):
         Actions("velocity", System(), plant=bare)
-
-
-def test_of_a_hold_far_longer_than_rates_last_nothing_is_left() -> None:
-    """Ten seconds, 200 per second: beyond what exponentials can tell."""
-    plant = Plant(body=Body(drag_rotational_nmsprad=2e-4))
-    assert Steering.of(System(), plant, 10.0).left[2] == 0.0
-    short = Steering.of(System(), plant, PERIOD_S)
-    rates = PERIOD_S / short.lag
-    np.testing.assert_allclose(short.left, rates / np.expm1(rates), rtol=1e-13)

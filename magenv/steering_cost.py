@@ -1,0 +1,242 @@
+"""What steering believes of the plant, and what EPM poses cost by the linear motion of a hold; see ``steering``."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magenv.angles import sincos
+from magenv.calm_holds import CalmHolds
+from magenv.forecast import STATE, Course, Goal
+from magenv.kernels import kernel
+from magenv.linear_hold import LinearHold, foresee, growth
+from magenv.local import local_basis, shift
+from magenv.magnets import robots_wrench
+from magenv.params import Plant, System
+from magenv.poses import EPM_SIZE, HOME_RADIUS_M, POSE_SIZE
+from magenv.sensitivity import COORDINATES, Model, place
+from magenv.stiffness import planar_kernel
+
+Floats = NDArray[np.float64]
+
+_POSITION_M, _HEADING_RAD = 1e-4, 3e-3
+"""Misses that count one."""
+GROWTH = 0.5
+"""Growth of errors that counts one: so many times e in a hold."""
+LINEAR = 3.0
+"""Growth, so many times e, up to which descents find their way."""
+_FIELD_T, _FIELD_SPREAD_T = 0.010, 0.020
+"""Field along a heading, and by how much another one counts one."""
+_RADIUS_SPREAD_M = 0.16
+"""By how much another radius than that at home counts one."""
+_ROWS = COORDINATES + 3
+"""Residuals apart from those of the radii."""
+_DIFFERENCE = 1e-6
+"""Over which slopes are taken."""
+
+
+class Steering(NamedTuple):
+    """What steering believes of the plant, and where else it starts from."""
+
+    hold: LinearHold
+    model: Model
+    """Nominal magnets, stepped as the plant is; kernels work in copies of it."""
+    substeps: int
+    """Of the model in a hold."""
+    calm: CalmHolds
+
+    @classmethod
+    def of(cls, system: System, plant: Plant, period_s: float, calm: CalmHolds | None = None) -> Steering:
+        """Return the steering on a nominal plant, with holds of ``period_s`` (s); ``calm`` is by default the table."""
+        substeps = plant.substeps(period_s)
+        model = Model.of(system, plant, period_s / substeps)
+        calm = CalmHolds.load(system.n_epm) if calm is None else calm
+        return cls(LinearHold.of(plant.body, period_s), model, substeps, calm)
+
+
+class Workspace(NamedTuple):
+    """Room to compute in, for one thread."""
+
+    model: Model
+    positions: Floats
+    """(2, 3) of the robots, in m and A m^2; so are the moments."""
+    moments: Floats
+    ahead: Floats
+    """(6,) how far the robots should come in the hold, m and rad."""
+    goal: Goal
+    """Where they should be at the end of what is looked at."""
+    course: Course
+    """EPMs that stand still."""
+    force: Floats
+    """(6,) wrench on the robots, N and N m."""
+    stiffness: Floats
+    """(6, 6) of it, N and N m per m and rad."""
+    moved: Floats
+    """(6,) how far they come by the linear motion; so are the rates."""
+    rates: Floats
+    landed: Floats
+    """(12,) state by the motion itself."""
+    scaled: Floats
+    """(6, 6) room for ``growth``, as the next two."""
+    exponential: Floats
+    product: Floats
+    trial: Floats
+    """(N, 6) EPMs."""
+    bases: Floats
+    """(N, 6, 5)"""
+    residuals: Floats
+    """(r,) by the linear motion."""
+    others: Floats
+    jacobian: Floats
+    """(r, 5 N)"""
+    misses: Floats
+    """(12,) by the motion itself, of rates zero."""
+    slopes: Floats
+    """(12, 5 N)"""
+    sensitivity: Floats
+    """(12, 5 N) of the state."""
+    normal: Floats
+    """(5 N, 5 N)"""
+    factor: Floats
+    downhill: Floats
+    """(5 N,)"""
+    step: Floats
+
+
+@kernel
+def workspace(s: Steering) -> Workspace:
+    """Return room of one's own."""
+    n, m = s.calm.epms.shape[1], s.model
+    u, rows, c = POSE_SIZE * n, _ROWS + n, COORDINATES
+    model = Model(
+        m.lane.copy(),
+        m.epm_moment.copy(),
+        m.nominal,
+        m.substep,
+        np.zeros((2, 3)),
+        np.zeros((2, 3)),
+        np.zeros((c, c)),
+        np.zeros((c, EPM_SIZE * n)),
+    )
+    weights = np.zeros(STATE)
+    for i in range(c):
+        weights[i] = 1.0 / (_HEADING_RAD if i % 3 == 2 else _POSITION_M)
+    course = Course(
+        np.zeros(s.substeps, np.int64), np.zeros((1, n, EPM_SIZE)), np.zeros((1, 2, n, EPM_SIZE, POSE_SIZE)), False
+    )
+    return Workspace(
+        model,
+        np.zeros((2, 3)),
+        np.zeros((2, 3)),
+        np.empty(c),
+        Goal(np.full(1, s.substeps), np.zeros((1, 1, STATE)), weights, np.zeros((1, n, EPM_SIZE)), 0.0, 0.0),
+        course,
+        np.empty(c),
+        np.empty((c, c)),
+        np.empty(c),
+        np.empty(c),
+        np.empty(STATE),
+        np.empty((c, c)),
+        np.empty((c, c)),
+        np.empty((c, c)),
+        np.empty((n, EPM_SIZE)),
+        np.zeros((n, EPM_SIZE, POSE_SIZE)),
+        np.empty(rows),
+        np.empty(rows),
+        np.empty((rows, u)),
+        np.empty(STATE),
+        np.empty((STATE, u)),
+        np.empty((STATE, u)),
+        np.empty((u, u)),
+        np.empty((u, u)),
+        np.empty(u),
+        np.empty(u),
+    )
+
+
+@kernel
+def locate(w: Workspace, state: Floats, ahead: Floats) -> None:
+    """Put the robots of ``state`` (12,) into the room, and that they should come as far as ``ahead`` (6,)."""
+    n = len(w.model.epm_moment)
+    w.ahead[:] = ahead
+    for robot in range(2):
+        sine, cosine = sincos(state[3 * robot + 2])
+        moment = w.model.nominal[n + robot]
+        w.positions[robot, 0], w.positions[robot, 1] = state[3 * robot], state[3 * robot + 1]
+        w.moments[robot, 0], w.moments[robot, 1] = moment * cosine, moment * sine
+
+
+@kernel
+def look(s: Steering, w: Workspace, state: Floats, grown: float) -> int:
+    """Let the goal be where robots should be once errors that grow by ``grown`` in a hold have grown by ``LINEAR``.
+
+    At the latest at the hold's end. Returns after how many substeps of the linear motion that is.
+    """
+    share = LINEAR / grown if grown > LINEAR else 1.0
+    substeps = max(1, round(share * s.hold.substeps))
+    share = substeps / s.hold.substeps
+    w.goal.marks[0] = max(1, round(share * s.substeps))
+    for i in range(COORDINATES):
+        w.goal.references[0, 0, i] = state[i] + share * w.ahead[i]
+    return substeps
+
+
+@kernel
+def weigh(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats, out: Floats) -> float:
+    """Write the residuals (r,) of EPMs (N, 6) by the linear motion; return their squared sum."""
+    model, n = w.model, len(epms)
+    place(model, epms)
+    force = robots_wrench(model.lane, 0, n, None, state[0], state[1], state[2], state[3], state[4], state[5])
+    for i in range(COORDINATES):
+        w.force[i] = force[i]
+    planar_kernel(w.positions, w.moments, epms, model.epm_moment, False, w.stiffness, model.gradients)
+    foresee(s.hold, substeps, w.force, w.stiffness, state[COORDINATES:], w.moved, w.rates)
+    for i in range(COORDINATES):
+        out[i] = w.goal.weights[i] * (state[i] + w.moved[i] - w.goal.references[0, 0, i])
+    out[COORDINATES] = max(growth(s.hold, w.stiffness, w.scaled, w.exponential, w.product), 0.0) / GROWTH
+    for robot in range(2):
+        turn = 3 * robot + 2
+        field = -w.stiffness[turn, turn] / model.nominal[n + robot]
+        out[COORDINATES + 1 + robot] = (field - _FIELD_T) / _FIELD_SPREAD_T
+    for k in range(n):
+        x, y, z = epms[k, 0], epms[k, 1], epms[k, 2]
+        out[_ROWS + k] = (math.sqrt(x * x + y * y + z * z) - HOME_RADIUS_M) / _RADIUS_SPREAD_M
+    cost = 0.0
+    for value in out:
+        cost += value * value
+    return cost
+
+
+@kernel
+def normal_equations(w: Workspace, residuals: Floats, slopes: Floats) -> None:
+    """Write those of residuals (r,) and their slopes (r, 5 N)."""
+    for p in range(len(w.downhill)):
+        total = 0.0
+        for i in range(len(residuals)):
+            total -= slopes[i, p] * residuals[i]
+        w.downhill[p] = total
+        for q in range(p + 1):
+            total = 0.0
+            for i in range(len(residuals)):
+                total += slopes[i, p] * slopes[i, q]
+            w.normal[p, q] = total
+
+
+@kernel
+def differentiate_cost(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats) -> None:
+    """Write the slopes of the residuals by the EPMs' local coordinates, and the normal equations."""
+    step = np.zeros(POSE_SIZE)
+    for k in range(len(epms)):
+        local_basis(epms[k], w.bases[k])
+        for c in range(POSE_SIZE):
+            w.trial[:] = epms
+            step[:] = 0.0
+            step[c] = _DIFFERENCE
+            shift(w.trial[k], w.bases[k], step, 0.0, math.inf)
+            weigh(s, w, state, substeps, w.trial, w.others)
+            for i in range(len(w.residuals)):
+                w.jacobian[i, POSE_SIZE * k + c] = (w.others[i] - w.residuals[i]) / _DIFFERENCE
+    normal_equations(w, w.residuals, w.jacobian)
