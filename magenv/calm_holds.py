@@ -1,4 +1,4 @@
-"""Calm holds: EPMs under which robots at rest stay so, and errors grow little, for robots placed in many ways.
+"""Calm holds: EPMs under which robots at rest nearly stay so, and errors grow little, for robots placed in many ways.
 
 The table is made by ``calm_search``. Holds of robots that are placed alike are where ``steering`` starts from when the
 present poses lead to nothing.

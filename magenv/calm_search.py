@@ -31,7 +31,7 @@ LINES, HALVES = 16, 12
 _PERIOD_S = 0.5
 _ITERATIONS = 60
 _HELD = 1.0
-"""Squared miss, in the units of ``steering.steer``, up to which robots are held."""
+"""Squared miss up to which a hold is one, as ``steering`` counts it: where errors grow fast, in its beginning."""
 _SWEEPS = 4
 
 

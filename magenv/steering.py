@@ -191,11 +191,11 @@ def _follow(s: Steering, w: Workspace, state: Floats, limits: Floats, grown: flo
 
     Returns the squared miss at the end of the hold.
     """
-    while grown > LINEAR:
+    while LINEAR < grown < math.inf:
         look(s, w, state, grown)
         _refine(w, state, limits, epms)
         grown *= _LESS
-    look(s, w, state, grown)
+    look(s, w, state, 0.0)
     return _refine(w, state, limits, epms)
 
 

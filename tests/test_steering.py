@@ -70,7 +70,7 @@ def test_what_is_foreseen_solves_the_equation_of_motion(rng: np.random.Generator
         motion[6:12, 12] = force / inertia
         exact = expm(motion * period) @ np.concatenate([np.zeros(6), rates, [1.0]])
         foresee(hold, hold.substeps, force, stiffness, rates, moved, then)
-        np.testing.assert_allclose(moved, exact[:6], rtol=0.03, atol=0.01 * np.abs(exact[:6]).max())
+        np.testing.assert_allclose(moved, exact[:6], rtol=0.03, atol=0.05 * np.abs(exact[:6]).max())
         np.testing.assert_allclose(then, exact[6:12], rtol=0.05, atol=0.02 * np.abs(exact[6:12]).max())
 
 
@@ -143,6 +143,18 @@ def test_where_nothing_can_be_foreseen_the_last_command_is_held() -> None:
     assert solver[0] == FELL_BACK
     np.testing.assert_array_equal(held, last)
     np.testing.assert_array_equal(expected, np.zeros((1, STATE)))
+
+
+@pytest.mark.parametrize("distance_m", [1e-7, 1e-4, 2e-3, 0.008, 0.011, 0.013, 0.015])
+def test_robots_that_nearly_touch_are_no_trouble(rng: np.random.Generator, distance_m: float) -> None:
+    """Errors that grow beyond all numbers: the search ends, and what it finds is within reach."""
+    actions, robots = Actions("velocity", System()), apart(rng, 8, distance_m)
+    with np.errstate(all="raise"):
+        epms, _ = actions.to_epms(rng.uniform(-1.0, 1.0, (8, COORDINATES)), robots, actions.home(robots))
+    radii = np.linalg.norm(epms[..., :3], axis=-1)
+    assert np.isfinite(epms).all()
+    assert radii.min() > System().r_min_m - 1e-6
+    assert radii.max() < System().r_max_m + 1e-6
 
 
 @pytest.mark.parametrize("control_hz", [2.0, 10.0, 50.0])
