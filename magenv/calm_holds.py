@@ -37,7 +37,9 @@ class CalmHolds(NamedTuple):
     def load(cls, n_epm: int) -> CalmHolds:
         """Return the table for 2 or 3 EPMs."""
         with np.load(TABLES / f"calm-holds-{n_epm}.npz", allow_pickle=False) as stored:
-            return cls(stored["placed"].astype(np.float64), stored["epms"].astype(np.float64))
+            placed, epms = (stored[name].astype(np.float64) for name in ("placed", "epms"))
+        epms[..., 3:] /= np.linalg.norm(epms[..., 3:], axis=-1, keepdims=True)
+        return cls(placed, epms)
 
 
 @kernel

@@ -207,15 +207,18 @@ def _from_calm_holds(
     heading: float,
     limits: Floats,
     found: tuple[float, float, float],
+    present: Floats,
     best: Floats,
-) -> float:
-    """Look for poses better than ``best`` (N, 6), which cost, miss and growth are ``found`` of, from calm holds.
+) -> None:
+    """Look for poses better than ``best`` (N, 6), of cost, miss and growth ``found``; they are written there, refined.
 
-    They are written there, refined. Returns their squared miss at the end of the hold.
+    From calm holds; where these lead to nothing either, from the ``present`` ones as they are.
     """
     cost, miss, grown = found
-    which, others = np.empty(_CANDIDATES, np.int64), np.empty((_CANDIDATES, *best.shape))
-    costs, growths = np.full(_CANDIDATES, math.inf), np.empty(_CANDIDATES)
+    which, others = np.empty(_CANDIDATES, np.int64), np.empty((_CANDIDATES + 1, *best.shape))
+    costs, growths = np.full(_CANDIDATES + 1, math.inf), np.empty(_CANDIDATES + 1)
+    others[_CANDIDATES] = present
+    costs[_CANDIDATES], _, growths[_CANDIDATES] = _descend(s, w, state, limits, 0, others[_CANDIDATES])
     nearest(s.calm, state, heading, which)
     for i in range(_CANDIDATES):
         if miss <= MET and i >= _CALMER:
@@ -232,7 +235,6 @@ def _from_calm_holds(
         other_miss = _follow(s, w, state, limits, growths[i], others[i])
         if other_miss < miss or not miss < math.inf:
             miss, best[:] = other_miss, others[i]
-    return miss
 
 
 @kernel
@@ -267,10 +269,9 @@ def steer(
     locate(w, state, ahead)
     best = epms.copy()
     found = _descend(s, w, state, limits, _ITERATIONS, best)
-    if found[1] <= MET and found[2] <= _CALM:
-        _follow(s, w, state, limits, found[2], best)
-    else:
-        _from_calm_holds(s, w, state, heading, limits, found, best)
+    calm = found[1] <= MET and found[2] <= _CALM
+    if not calm or not _follow(s, w, state, limits, found[2], best) <= MET:
+        _from_calm_holds(s, w, state, heading, limits, found, epms, best)
     miss = _land(w, state, best, np.empty((STATE, 0)))
     if miss < math.inf:
         epms[:] = best

@@ -55,8 +55,7 @@ def test_batch_is_the_scalar_env_bit_for_bit(
             assert_same_info(info_of(one[4], row), info_of(two[4], row))
         endings += one[2].sum(), one[3].sum()
     assert endings.sum() > 2 * N
-    slow = mode == "velocity" and control_hz == 10.0  # within a second, robots that jitter touch nothing
-    assert slow or endings.min() > 0
+    assert mode == "velocity" or endings.min() > 0  # robots that go where they are sent touch nothing in a second
     theirs.close()
 
 
