@@ -22,8 +22,7 @@ from magenv.params import InputError, require
 _PACKAGES = ("agents", "magenv")
 _ROOT = Path(__file__).parents[1]
 
-# The type of a field, as it stands in its class, and what JSON makes of it.
-_KINDS: dict[str, tuple[type, ...]] = {
+KINDS: dict[str, tuple[type, ...]] = {
     "str": (str,),
     "int": (int,),
     "bool": (bool,),
@@ -31,6 +30,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "float | None": (int, float, NoneType),
     "Interval": (list,),
 }
+"""The type of a field, as it stands in its class, and what JSON makes of it."""
 
 
 class Entry(Protocol):
@@ -97,7 +97,7 @@ class Table(Generic[E]):
         values = {}
         for field in fields(self.entry):  # type: ignore[arg-type]
             value, kind = entry[field.name], str(field.type)
-            fits = isinstance(value, _KINDS[kind]) and isinstance(value, bool) == (kind == "bool")
+            fits = isinstance(value, KINDS[kind]) and isinstance(value, bool) == (kind == "bool")
             require(fits, field.name, f"of type {kind}", value)
             if kind == "Interval":
                 low, high = map(float, value)

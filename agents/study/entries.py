@@ -10,11 +10,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from types import NoneType
 from typing import Any, TypeVar
 
 from agents.metrics import measure
 from agents.records import Record
+from agents.results import KINDS
 from magenv.files import write_file
 from magenv.params import InputError, require
 
@@ -167,13 +167,6 @@ def load_all(store: Path) -> list[Entry]:
     return [load(path) for path in found]
 
 
-_KINDS: dict[str, tuple[type, ...]] = {
-    "str": (str,),
-    "int": (int,),
-    "bool": (bool,),
-    "float": (int, float),
-    "float | None": (int, float, NoneType),
-}
 T = TypeVar("T")
 
 
@@ -214,7 +207,7 @@ def _value(name: str, kind: str, value: Any) -> Any:
     if kind == "dict[str, str]":
         fits = isinstance(value, Mapping) and all(isinstance(one, str) for one in value.values())
         require(fits, name, "a table of texts", value)
-    elif kind in _KINDS:
-        fits = isinstance(value, _KINDS[kind]) and isinstance(value, bool) == (kind == "bool")
+    elif kind in KINDS:
+        fits = isinstance(value, KINDS[kind]) and isinstance(value, bool) == (kind == "bool")
         require(fits and (not isinstance(value, float) or math.isfinite(value)), name, f"of type {kind}", value)
     return value
