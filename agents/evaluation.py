@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from agents.sb3_vec import threads_for
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
 
@@ -63,7 +64,7 @@ class HeldOut:
     """The held-out episodes of an environment, the first of them where fewer are asked for."""
 
     def __init__(self, settings: Settings, episodes: int = EPISODES) -> None:
-        self._n, self._episodes = episodes, Episodes(episodes, settings)
+        self._n, self._episodes = episodes, Episodes(episodes, settings, threads_for(settings))
 
     def score(self, predict: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Score:
         """Run all episodes to their ends and return what was reached.

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from magenv.actions import PLANAR
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.kernels import kernel
+from magenv.poses import LANES
 from magenv.state import State
 from magenv.steps import step_kernel
 from magenv.workers import Workers
@@ -53,6 +54,11 @@ def add_rows(s: State, sums: Floats, ends: Floats, rewards: Rewards, dones: Bool
     return count
 
 
+def threads_for(settings: Settings) -> int:
+    """Return how many threads should share the episodes of an environment."""
+    return THREADS if settings.action in PLANAR else 1
+
+
 def _types(*arguments: object) -> tuple[object, ...]:
     """Return numba's types of the arguments."""
     return tuple(typeof(argument) for argument in arguments)  # type: ignore[no-untyped-call]
@@ -80,7 +86,7 @@ class TwoRobotsVecEnv(VecEnv):
         state, packed = self._episodes.state, self._episodes.packed
         step: Any = step_kernel(settings.action, *self._episodes.world.shape)
         add: Any = add_rows
-        self._workers = Workers(THREADS if settings.action in PLANAR else 1)
+        self._workers = Workers(threads_for(settings), LANES)
         self._step = step.compile(_types(0, n, self._all, self._sums, packed, state.observation))
         self._add = add.compile(_types(packed, self._sums, self._ends, state.bounds, self._all))
 

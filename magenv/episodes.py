@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from magenv.actions import PLANAR, ActionMode, Actions
 from magenv.forecast import STATE
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
-from magenv.poses import EPM_SIZE, POSE_SIZE
+from magenv.poses import EPM_SIZE, LANES, POSE_SIZE
 from magenv.random_knots import RANDOM_EXTENT
 from magenv.reach import Shell
 from magenv.starts import Starts, holding_epms
@@ -103,7 +103,7 @@ class Episodes:
         self.layout = Layout(
             self.system, plant.workspace_radius_m, self.task.period_s, settings.observation, settings.frame
         )
-        self._workers = Workers(threads)
+        self._workers = Workers(threads, LANES if settings.action in PLANAR else None)  # searches differ in length
         shell = Shell.of(self.system, plant)
         self.actions = Actions(settings.action, self.system, self._workers, shell, plant, self.task.period_s)
         reach_and_gap = RANDOM_EXTENT if trajectory is None else extent(trajectory)

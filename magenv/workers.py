@@ -7,6 +7,7 @@ its own. (Numba's own pools spin, abort on concurrent use or do not survive a fo
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,16 +17,21 @@ from magenv.params import is_whole, require
 
 
 class Workers:
-    """Runs kernels over rows on ``threads`` threads, the calling one included; the bits do not depend on how many."""
+    """Runs kernels over rows on ``threads`` threads, the calling one included; the bits do not depend on how many.
 
-    def __init__(self, threads: int = 1) -> None:
+    Each takes an equal share of the rows; or, where some rows take far longer than others, ``at_once`` of them, and
+    then the next that nobody has taken.
+    """
+
+    def __init__(self, threads: int = 1, at_once: int | None = None) -> None:
         require(is_whole(threads) and threads >= 1, "threads", "a whole number of at least 1", threads)
         self.threads = threads
+        self._at_once = at_once
         self._pool: ThreadPoolExecutor | None = None
         self._owner = 0
 
-    def __reduce__(self) -> tuple[type[Workers], tuple[int]]:
-        return Workers, (self.threads,)
+    def __reduce__(self) -> tuple[type[Workers], tuple[int, int | None]]:
+        return Workers, (self.threads, self._at_once)
 
     def run(self, kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
         """Call ``kernel(first, last, *arguments)`` such that the ranges cover all rows once."""
@@ -34,8 +40,14 @@ class Workers:
             return
         if self._pool is None or self._owner != os.getpid():  # threads do not survive a fork
             self._pool, self._owner = ThreadPoolExecutor(self.threads - 1, "magenv"), os.getpid()
-        ends = [rows * k // self.threads for k in range(self.threads + 1)]
-        others = [self._pool.submit(kernel, *part, *arguments) for part in itertools.pairwise(ends[1:])]
-        kernel(ends[0], ends[1], *arguments)
+        share = math.ceil(rows / self.threads)
+        parts = itertools.pairwise([*range(0, rows, min(share, self._at_once or share)), rows])
+
+        def work() -> None:
+            for first, last in parts:  # one iterator for all: each part is taken once
+                kernel(first, last, *arguments)
+
+        others = [self._pool.submit(work) for _ in range(self.threads - 1)]
+        work()
         for other in others:
             other.result()

@@ -200,9 +200,10 @@ def test_threads_must_be_a_whole_number(threads: Any) -> None:
 
 
 def test_every_row_is_run_once_and_errors_are_told() -> None:
-    seen: list[int] = []
-    Workers(3).run(lambda first, last: seen.extend(range(first, last)), 20)
-    assert sorted(seen) == list(range(20))
+    for at_once in (None, 1, 3, 50):
+        seen: list[int] = []
+        Workers(3, at_once).run(lambda first, last, seen: seen.extend(range(first, last)), 20, seen)
+        assert sorted(seen) == list(range(20))
 
     def fail(first: int, last: int) -> None:
         if last == 20:

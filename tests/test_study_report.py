@@ -27,7 +27,7 @@ from agents.study.evidence import collect
 from agents.study.figures import curves, profiles
 from agents.study.trainings import SCENARIOS, training
 
-SEEDS = {"ppo-home": 3, "sac-home": 2, "ppo-pose": 2, "ppo-errors": 1}
+SEEDS = {"ppo-home": 3, "sac-home": 2, "ppo-pose": 2, "short-errors": 1}
 CONTROLLERS = ("baseline", "tuned", "ppo")
 LABELS = {"ppo": "ppo (as it ships)"}
 Rows = dict[str, list[str]]
@@ -125,7 +125,7 @@ def test_ablations_stand_beside_the_main_agents_of_their_algorithm(page: Path) -
     for table in tables(page, "Ablation: action"):
         assert list(table) == ["", "ppo-home", "ppo-pose"]
     for table in tables(page, "Ablation: observation"):
-        assert list(table) == ["", "ppo-home", "ppo-errors"]
+        assert list(table) == ["", "ppo-home", "short-errors"]
 
 
 def test_every_record_is_told_how_it_was_made(store: Path, page: Path) -> None:

@@ -41,6 +41,9 @@ class Training:
 HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6)
 """Poses need more room to explore than velocities."""
 
+SHORT = 500_000
+"""Steps of trainings that are compared with each other alone."""
+
 TRAININGS = (
     Training(
         "ppo-home",
@@ -78,9 +81,43 @@ TRAININGS = (
         TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=1_000_000),
         group="ablation: action",
     ),
-    Training("ppo-global", "the global frame", TrainConfig(frame="global"), group="ablation: observation"),
-    Training("ppo-errors", "pose errors alone", TrainConfig(observation="errors"), group="ablation: observation"),
-    Training("ppo-three", "three EPMs", TrainConfig(n_epm=3), group="three EPMs"),
+    Training("short", "`ppo-velocity` in fewer steps", TrainConfig(steps=SHORT), group="ablation: observation"),
+    Training(
+        "short-global", "the global frame", TrainConfig(frame="global", steps=SHORT), group="ablation: observation"
+    ),
+    Training(
+        "short-errors",
+        "pose errors alone",
+        TrainConfig(observation="errors", steps=SHORT),
+        group="ablation: observation",
+    ),
+    Training(
+        "short-one",
+        "one scenario alone, `approach-30`, instead of the random family",
+        TrainConfig(scenario="approach-30", steps=SHORT),
+        group="ablation: trajectories",
+    ),
+    Training(
+        "residual-three",
+        "PPO that corrects `steered`",
+        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
+        group="three EPMs",
+    ),
+    Training("ppo-three", "PPO as it comes", TrainConfig(n_epm=3, steps=SHORT), group="three EPMs"),
+    Training(
+        "residual-10hz",
+        "PPO that corrects `steered`",
+        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
+        group="10 Hz",
+        scenarios=("approach-30", "approach-22.5", "approach-20"),
+    ),
+    Training(
+        "arm-home",
+        "PPO by offsets from the home configuration, trained on `arm`, where all parameters are drawn anew",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
+        group="arms",
+        scenarios=("approach-60", "approach-30"),
+    ),
 )
 """All trainings, in the order of tables; a further one is a further entry."""
 
