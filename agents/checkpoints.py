@@ -13,7 +13,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.configs import PPOConfig, SACConfig, TrainConfig
+from agents.configs import CloningConfig, PPOConfig, SACConfig, TrainConfig
 from agents.evaluation import Score
 from agents.networks import flatten, load_weights, unflatten_like
 from agents.store import (
@@ -163,6 +163,7 @@ def stored_config(run: Path) -> TrainConfig:
         raw["ppo"], raw["sac"] = (
             cls(**(raw[key] | {"net": tuple(raw[key]["net"])})) for key, cls in (("ppo", PPOConfig), ("sac", SACConfig))
         )
+        raw["cloning"] = CloningConfig(**raw["cloning"])
         return TrainConfig(**(raw | {"out": None, "resume": run}))
     except (KeyError, TypeError) as error:
         raise InputError(

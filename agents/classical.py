@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from agents.baseline import Baseline, paper_baseline, tuned_baseline
 from agents.controller import Controller, Idle, Random
+from agents.homing import Homing
 from agents.predictive import Predictive
 from agents.steered import Steered
 from magenv.params import require
@@ -13,6 +14,7 @@ CLASSICAL: dict[str, type[Baseline | Predictive | Steered | Idle | Random]] = {
     "tuned": Baseline,
     "predictive": Predictive,
     "predictive-robust": Predictive,
+    "predictive-home": Homing,
     "steered": Steered,
     "idle": Idle,
     "random": Random,
@@ -43,6 +45,8 @@ def classical(name: str, n_epm: int = 2, control_hz: float = 2.0, plant: str = "
             return Predictive(n_epm, control_hz, plant)
         case "predictive-robust":
             return Predictive(n_epm, control_hz, plant, name, doubt=_DOUBT)
+        case "predictive-home":
+            return Homing(n_epm, control_hz, plant)
         case "steered":
             return Steered(control_hz)
         case "idle":

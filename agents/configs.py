@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from agents.residual import Correction
+from agents.classical import CLASSICAL
+from agents.residual import Correction, teacher
 from magenv.actions import ActionMode
 from magenv.episodes import Settings
 from magenv.params import require
@@ -105,6 +106,30 @@ class SACConfig:
         _number(0, 1, gamma=self.gamma)
 
 
+@dataclass(frozen=True)
+class CloningConfig:
+    """Hyperparameters of cloning a controller."""
+
+    rounds: int = 10
+    """After each, the policy is fitted to all that the controller has answered so far."""
+    steps: int = 64
+    """Of each episode in a round."""
+    led: int = 5
+    """Rounds in which the controller still acts in some episodes: in all of the first, then in ever fewer."""
+    epochs: int = 10
+    """Passes over the answers after each round."""
+    batch_size: int = 256
+    """Samples of a gradient step."""
+    learning_rate: float = 1e-3
+    """At the start; it falls linearly to a tenth in the last round."""
+
+    def __post_init__(self) -> None:
+        _whole(1, 65_536, rounds=self.rounds, steps=self.steps, epochs=self.epochs)
+        _whole(0, self.rounds, led=self.led)
+        _whole(2, math.inf, batch_size=self.batch_size)
+        _number(0, math.inf, learning_rate=self.learning_rate)
+
+
 STEPS: dict[Algo, int] = {"ppo": 1_500_000, "sac": 200_000}
 """Environment steps of a training where none are asked for."""
 
@@ -123,7 +148,7 @@ class TrainConfig:
     """Number of external magnets, 2 or 3."""
     action: ActionMode | None = None
     """What an action means: home, pose, step, wrench or velocity; by default velocity, or as of the controller of
-    --residual."""
+    --residual or --expert."""
     observation: ObservationMode = "full"
     """What the agent sees: full or errors."""
     frame: Frame = "robots"
@@ -134,8 +159,11 @@ class TrainConfig:
     """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
     residual_scale: float = 0.1
     """How far the policy may correct it, of the bounds of an action: above 0, at most 1."""
+    expert: str | None = None
+    """Name of a controller that the policy is cloned from before it learns by itself (of those of evaluate.py, no
+    learned one; ppo alone)."""
     steps: int | None = None
-    """Environment steps; by default 1.5 million (ppo) or 200,000 (sac)."""
+    """Environment steps, those of cloning included; by default 1.5 million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None
@@ -152,6 +180,7 @@ class TrainConfig:
     """Trials of --tune; by default 20."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     sac: SACConfig = field(default_factory=SACConfig)
+    cloning: CloningConfig = field(default_factory=CloningConfig)
 
     def __post_init__(self) -> None:
         require(self.algo in STEPS, "algo", " or ".join(STEPS), self.algo)
@@ -165,6 +194,11 @@ class TrainConfig:
             require(self.tune, "trials", "given with --tune", self.trials)
             _whole(1, math.inf, trials=self.trials)
         _ = self.correction  # which checks what it is made of
+        if self.expert is not None:
+            require(self.expert in CLASSICAL, "expert", f"one of {', '.join(CLASSICAL)}", self.expert)
+            require(self.algo == "ppo", "algo", "ppo with --expert", self.algo)
+            require(self.residual is None, "expert", "given without --residual", self.residual)
+            teacher(self.expert, self.settings, "cloned")
 
     @property
     def correction(self) -> Correction | None:
@@ -186,7 +220,8 @@ class TrainConfig:
     @property
     def settings(self) -> Settings:
         """The environment."""
-        action = self.action or ("velocity" if self.correction is None else self.correction.action)
+        shown = self.expert or self.residual
+        action = self.action or ("velocity" if shown is None else CLASSICAL[shown].action)
         return Settings(self.scenario, self.plant, self.n_epm, action, self.observation, self.frame, self.control_hz)
 
     @property

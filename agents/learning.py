@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.checkpoints import MODEL, check_goes_on, is_run, restore
+from agents.cloning import clone
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.folders import lock_folder, new_folder
 from agents.keeper import Keeper, Watch
@@ -156,6 +157,9 @@ def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command
     model.set_logger(logger(config, begun))
     try:
         try:
+            if config.expert is not None:
+                assert isinstance(model, PPO)
+                clone(config, model, env, CallbackList(callbacks))
             interval = 1 if config.algo == "ppo" else 50
             model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
         except KeyboardInterrupt:

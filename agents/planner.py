@@ -85,7 +85,7 @@ class Planner:
         best, sought = last.copy(), False
         if not np.isfinite([*problem.state, *problem.pushing]).all():
             return best, math.inf, sought
-        cost = self._polish(problem, best)
+        cost = self.polish(problem, best)
         turn = 0
         while not cost < ENOUGH * self._stages and turn < self._searches(cost):
             new, commands = self._from_elsewhere(problem, best, turn, cost, rng)
@@ -113,7 +113,7 @@ class Planner:
         move(self.arms, before, command, np.empty((0, len(command), EPM_SIZE, POSE_SIZE)), self._motion)
         return self._motion.path[self._motion.which]
 
-    def _polish(self, problem: Problem, commands: Floats) -> float:
+    def polish(self, problem: Problem, commands: Floats) -> float:
         """Improve commands (H, N, 6) in place; return their cost."""
         return plan(
             self.model,
@@ -139,7 +139,7 @@ class Planner:
             for command in commands:
                 allow(self.arms, before, command)
                 before = command
-            return self._polish(problem, commands), commands
+            return self.polish(problem, commands), commands
         first = self._held(problem, rng) if turn % 2 == 0 else beside(best[:1], BESIDE, rng)
         return self._one_after_another(problem, first, least, rng)
 
@@ -167,7 +167,7 @@ class Planner:
             found = [self._led_up_to(later, self._held(later, rng)) for _ in range(LATER_SEARCHES)]
             commands.append(min(found, key=lambda pair: pair[0])[1][0])
         whole = np.stack(commands)
-        return self._polish(problem, whole), whole
+        return self.polish(problem, whole), whole
 
     def _held(self, problem: Problem, rng: np.random.Generator) -> Floats | None:
         """Return a command (1, N, 6) that holds the robots on their way by statics, None where there is none."""

@@ -306,13 +306,20 @@ class Predictive:
         goal = self._goal(memory, references, known[STATE:MOMENTS].copy(), rng)
         doubt: Floats = _root(covariance[:STATE, :STATE] + np.diag(self._floor**2))
         problem = Problem(known[:STATE].copy(), known[STATE:MOMENTS].copy(), doubt, goal, before)
-        memory.commands, cost, sought = self._planner.plan(problem, memory.commands, rng)
+        memory.commands, cost, sought = self._plan(problem, memory.commands, rng)
         if not math.isfinite(cost):
             memory.commands = np.repeat(before[None], self._stages, axis=0)
             return FALLBACK
         if not self._plant.epms_jump:  # there, noise and ways cost as well
             return UNSOLVED if self._planner.missed(problem, memory.commands) > TROUBLE * self._stages else CONVERGED
         return UNSOLVED if cost > ENOUGH * self._stages else SOUGHT if sought else CONVERGED
+
+    def _plan(self, problem: Problem, last: Floats, rng: np.random.Generator) -> tuple[Floats, float, bool]:
+        """Return the commands (H, N, 6) for a problem, their cost, and whether they were sought elsewhere than here.
+
+        ``last`` (H, N, 6) is the last plan.
+        """
+        return self._planner.plan(problem, last, rng)
 
 
 def _root(covariance: Floats) -> Floats:

@@ -43,7 +43,8 @@ class Reporter(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._bar.start()
-        self._task = self._bar.add_task(self._config.algo, total=self._config.total_steps, told="")
+        if not self._bar.tasks:  # else it goes on from cloning
+            self._task = self._bar.add_task(self._config.algo, total=self._config.total_steps, told="")
 
     def _on_step(self) -> bool:
         self._episodes.extend(info for info in self.locals["infos"] if "is_success" in info)

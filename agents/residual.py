@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from agents.classical import CLASSICAL, classical
 from agents.controller import Actions, Controller, Observations
-from magenv.actions import ActionMode
 from magenv.episodes import Settings
 from magenv.params import require
 from magenv.task import ERRORS_SIZE
@@ -32,6 +31,25 @@ def corrected(base: Actions, correction: Actions, scale: float) -> Actions:
     """Return the controller's actions (..., a) plus ``scale`` times the policy's, within [-1, 1]."""
     actions: Actions = np.clip(base + np.float32(scale) * correction, -1.0, 1.0, dtype=np.float32)
     return actions
+
+
+def teacher(name: str, settings: Settings, role: str) -> Controller:
+    """Return the classical controller of this name, made for the environment in which a policy is trained beside it.
+
+    One that sees errors alone may go with a policy that sees more (``seen_by``). ``role`` tells in errors what becomes
+    of it.
+
+    Raises
+    ------
+    ValueError
+        If it speaks to another environment.
+    """
+    base = classical(name, settings.n_epm, settings.control_hz, settings.plant)
+    for part in ("action", "observation", "frame"):
+        own, asked = getattr(base, part), getattr(settings, part)
+        fits = own == asked or (part == "observation" and own == "errors")
+        require(fits, part, f"{own!r}, as of {name}, which is {role}", asked)
+    return base
 
 
 @dataclass(frozen=True)
@@ -55,27 +73,9 @@ class Correction:
         number = isinstance(self.scale, int | float) and not isinstance(self.scale, bool)
         require(number and 0.0 < self.scale <= 1.0, "residual_scale", "a number above 0, at most 1", self.scale)
 
-    @property
-    def action(self) -> ActionMode:
-        """Action mode of the controller, and so of the policy."""
-        return CLASSICAL[self.controller].action
-
     def base(self, settings: Settings) -> Controller:
-        """Return the controller, made for the environment in which the policy is trained.
-
-        One that sees errors alone may be corrected by a policy that sees more (``seen_by``).
-
-        Raises
-        ------
-        ValueError
-            If it speaks to another one.
-        """
-        base = classical(self.controller, settings.n_epm, settings.control_hz, settings.plant)
-        for name in ("action", "observation", "frame"):
-            own, asked = getattr(base, name), getattr(settings, name)
-            fits = own == asked or (name == "observation" and own == "errors")
-            require(fits, name, f"{own!r}, as of {base.name}, which is corrected", asked)
-        return base
+        """Return the controller, made for the environment (see ``teacher``)."""
+        return teacher(self.controller, settings, "corrected")
 
 
 class Corrected:

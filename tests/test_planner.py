@@ -55,7 +55,7 @@ def test_a_good_plan_is_found_from_elsewhere(stages: int, n_epm: int) -> None:
 def test_commands_made_one_after_another_are_good_before_they_are_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each reckons with where the one before lands, and aims at a reference of its own."""
     planner, problem = a_planner(3, 3), a_problem(3, 3)
-    monkeypatch.setattr(planner, "_polish", lambda problem, commands: cost_of(planner, problem, commands))
+    monkeypatch.setattr(planner, "polish", lambda problem, commands: cost_of(planner, problem, commands))
     costs = [
         planner._from_elsewhere(problem, problem.before[None], 0, math.inf, np.random.default_rng(seed))[0]
         for seed in range(5)

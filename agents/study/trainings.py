@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agents.checkpoints import GOING_ON
-from agents.configs import STEPS, PPOConfig, TrainConfig
+from agents.configs import STEPS, CloningConfig, PPOConfig, TrainConfig
 from magenv.params import require
 
 SCENARIOS = ("approach-60", "approach-30", "approach-22.5", "crossing-30", "meeting-30", "eight-30", "still-30")
@@ -40,8 +40,10 @@ class Training:
 
 HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6)
 """Poses need more room to explore than velocities."""
+CLONE_PPO = PPOConfig(learning_rate=2e-4, log_std_init=-3.5)
+"""A clone is near what it looks for."""
 
-SHORT = 500_000
+SHORT = 200_000
 """Steps of trainings that are compared with each other alone."""
 
 TRAININGS = (
@@ -62,6 +64,18 @@ TRAININGS = (
         "PPO that corrects `steered`",
         TrainConfig(residual="steered", residual_scale=0.2, steps=500_000),
         seeds=(0, 1, 2, 3, 4),
+    ),
+    Training(
+        "clone-steered",
+        "PPO that begins as a clone of `steered`",
+        TrainConfig(expert="steered", ppo=CLONE_PPO, steps=300_000),
+        seeds=(0, 1, 2, 3, 4),
+    ),
+    Training(
+        "clone-predictive",
+        "PPO that begins as a clone of `predictive-home`, in absolute poses",
+        TrainConfig(expert="predictive-home", ppo=CLONE_PPO, cloning=CloningConfig(steps=32), steps=1_000_000),
+        group="ablation: action",
     ),
     Training(
         "ppo-pose",

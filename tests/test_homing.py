@@ -1,0 +1,50 @@
+"""The predictive controller that is drawn home: its commands hang on the present alone, and they serve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from messages import refusal
+
+from agents.homing import Homing
+from agents.rollout import run
+from magenv.episodes import Episodes, Settings
+
+
+def test_it_holds_both_approaches() -> None:
+    for scenario, worst_mm in (("approach-60", 0.4), ("approach-30", 1.0)):
+        (record,) = run(Homing(), scenario, episodes=1)
+        assert record.success
+        assert 1e3 * np.mean(record.position_error_m) < worst_mm
+        assert np.degrees(np.mean(record.heading_error_rad)) < 1.0
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_its_commands_hang_on_no_earlier_ones(n_epm: int) -> None:
+    episodes = Episodes(2, Settings("approach-60", n_epm=n_epm, action="pose"))
+    for row in range(2):
+        episodes.seed(row, np.random.default_rng(row))
+    active = np.ones(2, np.bool_)
+    one, state = Homing(n_epm), None
+    observations = episodes.start(active)
+    for _ in range(3):
+        actions, state = one.predict(observations, state)
+        observations = episodes.step(actions.astype(np.float64), active)
+    assert state is not None
+    wanted, _ = one.predict(observations, state)
+    rng = np.random.default_rng(7)
+    other = Homing(n_epm)
+    other.seed(99)
+    for memory in state.rows:
+        assert memory is not None
+        memory.commands = memory.commands + rng.normal(scale=0.1, size=memory.commands.shape)
+    # The memory has gone on by an instant: what it knows is the present once more where no time has passed.
+    fresh, _ = other.predict(observations, None)
+    again, _ = one.predict(observations, None)
+    np.testing.assert_array_equal(fresh, again)
+    assert np.isfinite(wanted).all()
+
+
+def test_epms_that_travel_are_refused() -> None:
+    told = refusal(Homing, 2, 2.0, "arm")
+    assert told == "Input plant must be one whose EPMs jump, for predictive-home; instead received 'arm'."
