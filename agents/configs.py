@@ -199,6 +199,8 @@ class TrainConfig:
             require(self.algo == "ppo", "algo", "ppo with --expert", self.algo)
             require(self.residual is None, "expert", "given without --residual", self.residual)
             teacher(self.expert, self.settings, "cloned")
+            asked = self.cloning.rounds * self.cloning.steps * self.ppo.n_envs
+            require(self.total_steps >= asked, "steps", f"at least {asked}, those of cloning", self.total_steps)
 
     @property
     def correction(self) -> Correction | None:

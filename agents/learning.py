@@ -161,7 +161,9 @@ def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command
                 assert isinstance(model, PPO)
                 clone(config, model, env, CallbackList(callbacks))
             interval = 1 if config.algo == "ppo" else 50
-            model.learn(config.total_steps - begun, callbacks, reset_num_timesteps=False, log_interval=interval)
+            model.learn(
+                config.total_steps - model.num_timesteps, callbacks, reset_num_timesteps=False, log_interval=interval
+            )
         except KeyboardInterrupt:
             finished = False
             if model.num_timesteps == begun:

@@ -39,7 +39,7 @@ TINY = dataclasses.replace(
 )
 
 
-class Broken(Exception):
+class BrokenOffError(Exception):
     """Ends a training."""
 
 
@@ -50,9 +50,9 @@ def broken_off(config: TrainConfig, after: int) -> None:
     def watch(score: Score) -> None:
         told.append(score)
         if len(told) == after:
-            raise Broken
+            raise BrokenOffError
 
-    with pytest.raises(Broken):
+    with pytest.raises(BrokenOffError):
         train(config, watch=watch)
 
 
@@ -60,22 +60,23 @@ def test_a_clone_does_what_the_controller_would(tmp_path: Path) -> None:
     config = TrainConfig(
         expert="steered",
         ppo=PPOConfig(n_envs=32, n_steps=2, batch_size=64, n_epochs=1, log_std_init=-4.0, net=(64, 64)),
-        cloning=CloningConfig(rounds=5, steps=32, led=2, epochs=20),
-        steps=5 * 32 * 32 + 64,
+        cloning=CloningConfig(rounds=4, steps=24, led=2, epochs=20),
+        steps=4 * 24 * 32 + 64,
         out=tmp_path / "run",
     )
     folder, finished = train(config)
     assert finished
-    agent, env = Learned(folder / "model"), TwoRobotsVecEnv(32, config.settings, 1234)
-    expert, observations = Steered(), env.reset()
-    differences, sizes = [], []
+    agent, env = Learned(folder / "model"), TwoRobotsVecEnv(32, config.settings, 1234)  # episodes it has never met
+    expert, observations, rng = Steered(), env.reset(), np.random.default_rng(0)
+    differences, answers = [], []
     for _ in range(20):
         own, _ = agent.predict(observations)
         answer, _ = expert.predict(seen_by(expert, observations))
         differences.append(own - answer)
-        sizes.append(answer)
-        observations, *_ = env.step(own)
-    assert np.std(differences) < 0.35 * np.std(sizes)  # of episodes it has never met
+        answers.append(answer)
+        noise = rng.normal(scale=0.2, size=own.shape)
+        observations, *_ = env.step(np.clip(own + noise, -1.0, 1.0).astype(np.float32))
+    assert np.std(differences) < 0.5 * np.std(answers)
 
 
 def test_cloning_counts_as_training_and_is_told(tmp_path: Path) -> None:
@@ -118,7 +119,7 @@ def test_a_run_broken_off_while_it_clones_asks_no_round_again(tmp_path: Path, mo
 
 def test_the_same_seed_clones_to_the_same_bits(tmp_path: Path) -> None:
     one, other = (train(dataclasses.replace(TINY, out=tmp_path / name))[0] for name in "ab")
-    first, second = tensors_of(one / "model"), tensors_of(other / "model")
+    first, second = tensors_of(one), tensors_of(other)
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
@@ -146,11 +147,10 @@ def test_damaged_answers_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "run" / ANSWERS
     kept, whole = load_file(path), path.read_bytes()
     path.write_bytes(whole[:50])
-    assert "must be a run with sound answers.safetensors" in refusal(train, going_on(tmp_path / "run"))
+    assert "must be a run with sound answers.safetensors" in refusal(lambda: train(going_on(tmp_path / "run")))
     save_file(kept | {"actions": kept["actions"][:, :5].copy()}, path)
-    assert f"of shapes (m, 63) and (m, 6); instead received (({ROUND}, 63), ({ROUND}, 5))" in refusal(
-        train, going_on(tmp_path / "run")
-    )
+    told = refusal(lambda: train(going_on(tmp_path / "run")))
+    assert f"of shapes (m, 63) and (m, 6); instead received (({ROUND}, 63), ({ROUND}, 5))" in told
     assert checkpoints(tmp_path / "run")
 
 
@@ -158,6 +158,7 @@ def test_damaged_answers_are_refused(tmp_path: Path) -> None:
     ("options", "told"),
     [
         ({"expert": "ppo"}, "Input expert must be one of baseline, "),
+        ({"expert": "steered", "steps": 1000}, "Input steps must be at least 81920, those of cloning"),
         ({"expert": "steered", "algo": "sac"}, "Input algo must be ppo with --expert; instead received 'sac'"),
         ({"expert": "steered", "residual": "steered"}, "Input expert must be given without --residual"),
         ({"expert": "steered", "action": "home"}, "Input action must be 'velocity', as of steered, which is cloned"),
@@ -168,7 +169,7 @@ def test_damaged_answers_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_cloned_is_refused(options: dict[str, Any], told: str) -> None:
-    assert told in refusal(TrainConfig, **options)
+    assert told in refusal(lambda: TrainConfig(**options))
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_what_cannot_be_cloned_is_refused(options: dict[str, Any], told: str) ->
     ],
 )
 def test_hyperparameters_of_cloning_are_checked(options: dict[str, Any], told: str) -> None:
-    assert told in refusal(CloningConfig, **options)
+    assert told in refusal(lambda: CloningConfig(**options))
 
 
 def test_the_action_mode_is_that_of_what_is_cloned() -> None:
