@@ -216,7 +216,8 @@ class Episodes:
         if len(self.state.held_epms) > 1:  # each row has a trajectory of its own
             for row in np.flatnonzero(mask).tolist():
                 start = self.world.trajectory(row).at(0.0)
-                self.state.held_epms[row] = holding_epms(start, self.system, self.world.motion.shell)
+                shell = self.world.motion.shell
+                self.state.held_epms[row] = holding_epms(start, self.system, shell, at_best=True)
 
     def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.

@@ -19,11 +19,13 @@ from magenv.actions import ActionMode
 from magenv.env import TwoRobots
 from magenv.home import home_epms
 from magenv.params import PLANTS, Plant, System, TaskParams
-from magenv.reach import Shell
+from magenv.poses import from_cartesian
+from magenv.reach import Shell, beyond_reach
 from magenv.starts import holding_epms
 from magenv.trajectories import Trajectory, shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.world import World
+from magenv.wrench import IN_PLANE, planar_moments, robot_wrench
 
 SCENARIOS = (
     "random, approach-<s>, crossing-<s>, meeting-<s>, eight-<s>, still-<s> or approach-<s>-anti "
@@ -285,6 +287,23 @@ def test_a_start_at_which_nothing_holds_the_robots(apart_m: float) -> None:
     with pytest.raises(ValueError, match=r"^Input reference must be one at whose start EPMs can hold the robots; inst"):
         holding_epms(reference, system, anywhere)
     assert np.isfinite(holding_epms(3 * reference, system, anywhere)).all()
+
+
+@pytest.mark.parametrize("plant", ["paper", "arm-reach"])
+def test_a_start_that_chance_draws_begins_as_well_as_it_can(plant: str) -> None:
+    """In line, two EPMs cannot hold robots nearer than 24 mm; the random family has such starts, and must go on."""
+    reference = np.array([[0.000871, 0.04582, -1.426596], [-0.007767, 0.065699, -1.437143]])
+    system, shell = System(), Shell.of(System(), PLANTS[plant])
+    epms = holding_epms(reference, system, shell, at_best=True)
+    positions = np.pad(reference[:, :2], ((0, 0), (0, 1)))
+    moments = planar_moments(reference[:, 2], system.ipm_moment_am2)
+    found, at_home = (
+        robot_wrench(positions, moments, from_cartesian(e[:, :3], e[:, 3:]), system.epm_moment_am2)[list(IN_PLANE)]
+        for e in (epms, home_epms(2))
+    )
+    assert np.linalg.norm(found[[1, 2, 4, 5]]) < np.linalg.norm(at_home[[1, 2, 4, 5]])  # forces
+    if plant == "arm-reach":
+        assert beyond_reach(epms, shell, False) == 0.0
 
 
 @pytest.mark.parametrize("knots", [np.zeros((33, 2)), np.zeros((32, 2, 3)), np.full((33, 2, 3), np.nan)])

@@ -62,6 +62,7 @@ def test_a_clone_does_what_the_controller_would(tmp_path: Path) -> None:
         ppo=PPOConfig(n_envs=32, n_steps=2, batch_size=64, n_epochs=1, log_std_init=-4.0, net=(64, 64)),
         cloning=CloningConfig(rounds=4, steps=24, led=2, epochs=20),
         steps=4 * 24 * 32 + 64,
+        checkpoint_every=10_000,
         out=tmp_path / "run",
     )
     folder, finished = train(config)
