@@ -128,6 +128,31 @@ def test_ablations_stand_beside_the_main_agents_of_their_algorithm(page: Path) -
         assert list(table) == ["", "ppo-home", "short-errors"]
 
 
+def test_other_environments_are_told_apart(tmp_path: Path) -> None:
+    """Controllers stand beside the agents of their environment, and agents are compared with those alone."""
+    a_store(tmp_path / "store", {"ppo-home": 1, "arm-home": 2}, ("tuned",))
+    on_arm = an_entry("baseline", plant="arm")
+    few = {scenario: on_arm.outcomes[scenario] for scenario in training("arm-home").scenarios}
+    entries.save(dataclasses.replace(on_arm, outcomes=few), tmp_path / "store")
+    for seed in range(2):
+        one = an_entry("arm-home", seed, plant="arm")
+        entries.save(dataclasses.replace(one, outcomes={name: one.outcomes[name] for name in few}), tmp_path / "store")
+    page = report.write_results(tmp_path / "store", tmp_path / "page")
+    for table in tables(page, "Agents and controllers"):
+        assert list(table) == ["", "tuned", "ppo-home"]
+        assert table[""] == ["seeds", *SCENARIOS]
+    for table in tables(page, "Arms"):
+        assert list(table) == ["", "baseline (arm, 2 EPMs, 2 Hz)", "arm-home (arm, 2 EPMs, 2 Hz)"]
+        assert table[""] == ["seeds", *few]
+    (compared,) = tables(page, "Agents against controllers")
+    assert [row for row in compared if row] == [
+        "ppo-home over tuned",
+        "arm-home (arm, 2 EPMs, 2 Hz) over baseline (arm, 2 EPMs, 2 Hz)",
+    ]
+    options = "--plant arm --n-epm 2 --control-hz 2 --scenarios approach-60 approach-30"
+    assert f"| `python -m agents.study controllers baseline {options}` |" in page.read_text()
+
+
 def test_every_record_is_told_how_it_was_made(store: Path, page: Path) -> None:
     text = page.read_text()
     for name, count in SEEDS.items():

@@ -33,9 +33,8 @@ pytestmark = pytest.mark.usefixtures("elsewhere", "tiny")
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the study know tiny trainings, and measure on one scenario."""
+    """Let the study know tiny trainings."""
     monkeypatch.setattr("agents.study.trainings.TRAININGS", (*TRAININGS, TINY, TINY_SAC))
-    monkeypatch.setattr(work, "SCENARIOS", (SCENARIO,))
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -151,7 +150,7 @@ def test_an_off_policy_training_comes_to_its_record(monkeypatch: pytest.MonkeyPa
 
 def test_controllers_are_measured_and_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     files = [Path("docs/study") / name / "controller.json" for name in ("idle", "ppo")]
-    call(monkeypatch, "controllers", "idle", "ppo", "--episodes", "1")
+    call(monkeypatch, "controllers", "idle", "ppo", "--episodes", "1", "--scenarios", SCENARIO)
     assert capsys.readouterr().out == "".join(f"stored: {file}\n" for file in files)
     for file in files:
         entry = entries.load(file)
@@ -160,6 +159,20 @@ def test_controllers_are_measured_and_kept(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(work, "run_shared", None)
     call(monkeypatch, "controllers", "idle", "ppo")
     assert capsys.readouterr().out == "".join(f"kept: {file}\n" for file in files)
+
+
+def test_a_controller_is_kept_once_per_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = ("--plant", "arm", "--n-epm", "3", "--control-hz", "5", "--scenarios", SCENARIO, "--episodes", "1")
+    call(monkeypatch, "controllers", "idle", "--episodes", "1", "--scenarios", SCENARIO)
+    call(monkeypatch, "controllers", "idle", *there)
+    usual, other = (Path("docs/study/idle") / name for name in ("controller.json", "controller-arm-3-epms-5hz.json"))
+    assert entries.load(usual).where == entries.USUAL
+    entry = entries.load(other)
+    assert entry.where == entries.Where("arm", 3, 5.0)
+    wanted = run(controller("idle", 3, 5.0, "arm"), SCENARIO, "arm", 3, 5.0, episodes=1)
+    assert entry.outcomes == {SCENARIO: entries.outcomes_of(wanted)}
+    usual.write_bytes(other.read_bytes())
+    assert "controller-arm-3-epms-5hz.json" in refusal(lambda: entries.load(usual))
 
 
 def test_times_are_those_in_training(tmp_path: Path) -> None:
@@ -203,6 +216,9 @@ def test_a_training_without_progress_is_refused(text: str | None, tmp_path: Path
         (["run", "tiny", "--episodes", "0"], "at least 1"),
         (["run", "tiny", "--jobs", "0"], "at least 1"),
         (["controllers", "idle", "nobody"], "baseline"),
+        (["controllers", "idle", "--scenarios", "approach-5"], "approach-5"),
+        (["controllers", "idle", "--scenarios", "approach-60", "approach-60"], "each once"),
+        (["controllers", "ppo", "--n-epm", "3"], "3"),
         (["evaluate", "tiny", "--model", "nothing", "--seed", "0"], "nothing"),
         (["evaluate", "nobody", "--model", "nothing", "--seed", "0"], "ppo-home"),
         (["report"], "docs/study"),

@@ -11,9 +11,9 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subco
 
 from agents.configs import command_of
 from agents.study import work
-from agents.study.entries import file_of
+from agents.study.entries import USUAL, Where, file_of
 from agents.study.report import write_results
-from agents.study.trainings import names, training
+from agents.study.trainings import SCENARIOS, names, training
 from magenv.command import friendly, parse
 from magenv.params import is_whole, require
 
@@ -88,12 +88,21 @@ class Controllers(_Measured):
 
     names: Positional[tuple[str, ...]] = ()
     """Of controllers."""
+    plant: str = USUAL.plant
+    """As in evaluate.py; so are the next three."""
+    n_epm: int = USUAL.n_epm
+    """Number of external magnets, 2 or 3."""
+    control_hz: float = USUAL.control_hz
+    """Control rate."""
+    scenarios: tuple[str, ...] = SCENARIOS
+    """Trajectories."""
 
     def do(self) -> None:
         """Measure, keep."""
         _check_names(self.names)
-        work.check_controllers(self.names)
-        _tell(work.run_controller(name, self.setting) for name in self.names)
+        where = Where(self.plant, self.n_epm, self.control_hz)
+        work.check_controllers(self.names, where, self.scenarios)
+        _tell(work.run_controller(name, self.setting, where, self.scenarios) for name in self.names)
 
 
 @dataclass(frozen=True, kw_only=True)

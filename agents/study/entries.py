@@ -24,6 +24,24 @@ _DIGITS = 5
 
 
 @dataclass(frozen=True)
+class Where:
+    """An environment, apart from its scenario."""
+
+    plant: str = "paper"
+    n_epm: int = 2
+    control_hz: float = 2.0
+
+    @property
+    def told(self) -> tuple[str, str, str]:
+        """Its parts as texts."""
+        return self.plant, f"{self.n_epm}-epms", f"{self.control_hz:g}hz"
+
+
+USUAL = Where()
+"""In which agents and controllers are measured if nothing else is said."""
+
+
+@dataclass(frozen=True)
 class Outcomes:
     """Episodes of one scenario, of seeds ``seed``, ``seed + 1``, ...; each tuple holds one value per episode."""
 
@@ -89,12 +107,24 @@ class Entry:
     @property
     def file(self) -> Path:
         """Where it is kept, below the store."""
-        return file_of(self.name, None if self.training is None else self.training.seed)
+        return (
+            controller_file(self.name, self.where) if self.training is None else file_of(self.name, self.training.seed)
+        )
+
+    @property
+    def where(self) -> Where:
+        """In which environment it was measured."""
+        return Where(self.plant, self.n_epm, self.control_hz)
 
 
-def file_of(name: str, seed: int | None) -> Path:
-    """Return where an agent of a seed, or a controller (None), is kept below the store."""
-    return Path(name) / ("controller.json" if seed is None else f"seed-{seed}.json")
+def file_of(name: str, seed: int) -> Path:
+    """Return where an agent of a seed is kept below the store."""
+    return Path(name) / f"seed-{seed}.json"
+
+
+def controller_file(name: str, where: Where) -> Path:
+    """Return where a controller is kept below the store."""
+    return Path(name) / ("controller.json" if where == USUAL else f"controller-{'-'.join(where.told)}.json")
 
 
 def outcomes_of(records: Sequence[Record]) -> Outcomes:

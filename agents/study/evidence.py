@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from agents import catalogue
 from agents.statistics import probability_of_improvement
 from agents.study import trainings
-from agents.study.entries import Entry, Made, Outcomes, load_all
+from agents.study.entries import USUAL, Entry, Made, Outcomes, Where, load_all
 from agents.study.trainings import MAIN, Training, check_told
 from magenv.params import require
 
 Floats = NDArray[np.float64]
 OfEpisodes = Callable[[Outcomes], float]
-
-_USUAL = ("paper", 2, 2.0)
 
 
 @dataclass(frozen=True)
@@ -35,17 +33,16 @@ class Measured:
     @property
     def label(self) -> str:
         """Name, and what is to be known of it: that it ships, and the setting where it is not the usual one."""
-        plant, n_epm, control_hz = self.setting
+        where = self.where
         notes = ["as it ships"] if self.training is None and self.name in catalogue.shipped() else []
-        if self.setting != _USUAL:
-            notes += [plant, f"{n_epm} EPMs", f"{control_hz:g} Hz"]
+        if where != USUAL:
+            notes += [where.plant, f"{where.n_epm} EPMs", f"{where.control_hz:g} Hz"]
         return f"{self.name} ({', '.join(notes)})" if notes else self.name
 
     @property
-    def setting(self) -> tuple[str, int, float]:
-        """Plant, number of EPMs and control rate of the measurement."""
-        first = self.entries[0]
-        return first.plant, first.n_epm, first.control_hz
+    def where(self) -> Where:
+        """In which environment it was measured."""
+        return self.entries[0].where
 
     @property
     def group(self) -> str:
@@ -134,8 +131,9 @@ def collect(store: Path) -> list[Measured]:
     _check_episodes(entries, store)
     measured = []
     for name in known:
-        chosen = [entry for entry in entries if entry.name == name]
-        if chosen:
+        own = [entry for entry in entries if entry.name == name]
+        for where in dict.fromkeys(entry.where for entry in own):
+            chosen = [entry for entry in own if entry.where == where]
             chosen.sort(key=lambda entry: -1 if entry.training is None else entry.training.seed)
             alike = {tuple(entry.outcomes) for entry in chosen}
             require(len(alike) == 1, str(store / name), "of the same scenarios with all seeds", sorted(alike))
@@ -156,7 +154,7 @@ def _check_episodes(entries: Sequence[Entry], store: Path) -> None:
 
 
 def scenarios_of(measured: Sequence[Measured]) -> list[str]:
-    """Return all scenarios, those of the study first."""
+    """Return all scenarios of any of them, those of the study first."""
     found = dict.fromkeys(scenario for one in measured for scenario in one.entries[0].outcomes)
     return sorted(found, key=lambda name: [*trainings.SCENARIOS, *found].index(name))
 
@@ -167,10 +165,16 @@ def groups(measured: Sequence[Measured]) -> list[str]:
 
 
 def beside(measured: Sequence[Measured], group: str) -> list[Measured]:
-    """Return the agents of a group, behind those of the main one that have the same algorithm."""
+    """Return the agents of a group, behind what they are compared with in the same environments.
+
+    That is the agents of the main group that have the same algorithm, and, where the environment is not the usual one,
+    the controllers.
+    """
     own = [one for one in measured if one.training is not None and one.group == group]
+    if group == MAIN:
+        return own
     algos = {one.training.config.algo for one in own if one.training is not None}
-    main = [
-        one for one in measured if one.training is not None and one.group == MAIN and one.training.config.algo in algos
-    ]
-    return [*main, *own] if group != MAIN else own
+    places = {one.where for one in own}
+    controllers = [one for one in measured if one.training is None and one.where in places - {USUAL}]
+    main = [one for one in beside(measured, MAIN) if one.training is not None and one.training.config.algo in algos]
+    return [*controllers, *(one for one in main if one.where in places), *own]

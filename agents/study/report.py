@@ -13,8 +13,9 @@ from agents.figures import png
 from agents.ladder import load as load_ladder
 from agents.report import drop_others
 from agents.study import figures, tables
+from agents.study.entries import USUAL
 from agents.study.evidence import Measured, beside, collect, groups, scenarios_of
-from agents.study.trainings import MAIN
+from agents.study.trainings import MAIN, SCENARIOS
 from magenv.files import check_output_dir, write_file
 
 _HEAD = """\
@@ -64,8 +65,8 @@ def write_results(store: Path, out: Path, ladders: Sequence[Path] = ()) -> Path:
     measured = collect(store)
     rungs = [rung for path in ladders for rung in load_ladder(path)[1]]
     check_output_dir(out)
-    scenarios = scenarios_of(measured)
-    controllers = [one for one in measured if one.training is None]
+    scenarios = [scenario for scenario in scenarios_of(measured) if scenario in SCENARIOS] or scenarios_of(measured)
+    controllers = [one for one in measured if one.training is None and one.where == USUAL]
     main = [*controllers, *beside(measured, MAIN)]
     pictures: dict[str, Figure] = {}
 
@@ -93,9 +94,10 @@ def write_results(store: Path, out: Path, ladders: Sequence[Path] = ()) -> Path:
         page += ["", _CURVES, *picture("curves", "Success and errors in training", figures.curves(trained, MAIN))]
     for group in groups(measured):
         compared = beside(measured, group)
-        page += ["", f"## {group[0].upper()}{group[1:]}", "", *tables.by_scenario(compared, scenarios)]
+        agents = [one for one in compared if one.training is not None]
+        page += ["", f"## {group[0].upper()}{group[1:]}", "", *tables.by_scenario(compared, scenarios_of(compared))]
         name = f"curves-{re.sub(r'[^a-z0-9]+', '-', group.lower())}"
-        page += picture(name, f"Success and errors in training, {group}", figures.curves(compared, group))
+        page += picture(name, f"Success and errors in training, {group}", figures.curves(agents, group))
     if rungs:
         page += ["", "## How close", "", *picture("ladder", "Success over separation", ladder_figures.draw(rungs))]
         page += ["", ladder_figures.tables(rungs)]

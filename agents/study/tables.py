@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from agents.configs import TrainConfig
 from agents.report import three_digits
 from agents.statistics import interquartile_mean, interval
-from agents.study.entries import Entry
+from agents.study.entries import USUAL, Entry
 from agents.study.evidence import (
     Measured,
     OfEpisodes,
@@ -20,7 +21,7 @@ from agents.study.evidence import (
     mean_until_end,
     success_rate,
 )
-from agents.study.trainings import as_told
+from agents.study.trainings import SCENARIOS, as_told
 from magenv.origin import UNKNOWN
 
 Floats = NDArray[np.float64]
@@ -108,7 +109,7 @@ def improvements(measured: Sequence[Measured], scenarios: Sequence[str]) -> list
     rows = []
     controllers = [one for one in measured if one.training is None]
     for agent in (one for one in measured if one.training is not None):
-        for controller in (one for one in controllers if one.setting == agent.setting):
+        for controller in (one for one in controllers if one.where == agent.where):
             both = [agent.measured_on([s]) and controller.measured_on([s]) for s in scenarios]
             cells = [
                 _chance(improvement(agent, controller, scenario)) if fits else _DASH
@@ -170,13 +171,23 @@ def _versions(versions: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {number}" for name, number in versions.items())
 
 
+def _measures(entry: Entry) -> str:
+    """Return the command that measures a controller."""
+    where, options = entry.where, []
+    if where != USUAL:
+        options = ["--plant", where.plant, "--n-epm", str(where.n_epm), "--control-hz", f"{where.control_hz:g}"]
+    if tuple(entry.outcomes) != SCENARIOS:
+        options += ["--scenarios", *entry.outcomes]
+    return shlex.join(["python", "-m", "agents.study", "controllers", entry.name, *options])
+
+
 def provenance(measured: Sequence[Measured]) -> list[str]:
     """Return how every record came about, a row each, with the numbers of its places and packages."""
     where, what, rows = places(measured), packages(measured), []
     for one in measured:
         for entry in one.entries:
             made = entry.training
-            command = f"python -m agents.study controllers {one.name}" if made is None else made.command
+            command = _measures(entry) if made is None else made.command
             training = (
                 [_DASH] * 4
                 if made is None

@@ -25,9 +25,10 @@ from agents.report import versions
 from agents.sharing import run_shared
 from agents.store import CARD, load_card
 from agents.study import entries
-from agents.study.entries import CURVE_POINTS, Curve, Entry, Made, outcomes_of, short
-from agents.study.trainings import SCENARIOS, Training, as_told, check_told, told_of, training
+from agents.study.entries import CURVE_POINTS, Curve, Entry, Made, Where, outcomes_of, short
+from agents.study.trainings import Training, as_told, check_told, told_of, training
 from magenv import origin
+from magenv.episodes import Episodes, Settings
 from magenv.files import check_output_dir, write_file
 from magenv.params import InputError, require
 
@@ -181,20 +182,26 @@ def evaluate(chosen: Training, seed: int, model: Path, setting: Setting) -> str:
     return _measure(agent, chosen.name, made, config.plant, config.n_epm, config.control_hz, chosen.scenarios, setting)
 
 
-def check_controllers(names: Sequence[str]) -> None:
-    """Raise ``InputError`` unless the catalogue knows all names."""
+def check_controllers(names: Sequence[str], where: Where, scenarios: Sequence[str]) -> None:
+    """Raise ``InputError`` unless the catalogue knows all names, there, and the environment all scenarios."""
+    distinct = len(scenarios) > 0 and len(set(scenarios)) == len(scenarios)
+    require(distinct, "scenarios", "one or more, each once", tuple(scenarios))
+    for scenario in scenarios:
+        Episodes(1, Settings(scenario, where.plant, where.n_epm, control_hz=where.control_hz))
     for name in names:
         require(name in catalogue.names(), "name", f"one of the controllers ({', '.join(catalogue.names())})", name)
+        catalogue.controller(name, where.n_epm, where.control_hz, where.plant)
 
 
-def run_controller(name: str, setting: Setting) -> str:
+def run_controller(name: str, setting: Setting, where: Where, scenarios: Sequence[str]) -> str:
     """Measure a controller of the catalogue, keep the record, and return in words where; one that is there is kept."""
-    check_controllers([name])
-    path = setting.store / entries.file_of(name, None)
+    check_controllers([name], where, scenarios)
+    path = setting.store / entries.controller_file(name, where)
     if path.exists():
         entries.load(path)
         return f"kept: {path}"
-    return _measure(catalogue.controller(name), name, None, "paper", 2, 2.0, SCENARIOS, setting)
+    controller = catalogue.controller(name, where.n_epm, where.control_hz, where.plant)
+    return _measure(controller, name, None, where.plant, where.n_epm, where.control_hz, scenarios, setting)
 
 
 def _measure(
