@@ -182,7 +182,7 @@ def check_goes_on(config: TrainConfig) -> Path:
     assert config.resume is not None
     own, last = stored_config(config.resume), checkpoints(config.resume)[-1]
     for field in dataclasses.fields(TrainConfig):
-        before, now = getattr(own, field.name), getattr(config, field.name)
+        before, now = getattr(own, field.name), getattr(config.resolved, field.name)
         same = field.name in GOING_ON or now == before
         require(same, field.name, f"{before!r}, as in the run gone on with", now)
     done = load_card(last).steps

@@ -24,6 +24,10 @@ from magenv.command import friendly
 
 SCENARIO = "approach-30"
 TINY = Training("tiny", "a tiny one", dataclasses.replace(PPO_CONFIG, action="pose"), (0, 1), scenarios=(SCENARIO,))
+TINY_USUAL = dataclasses.replace(
+    TINY, name="tiny-usual", config=dataclasses.replace(PPO_CONFIG, action=None, residual="idle")
+)
+"""Its action mode is that of what it corrects."""
 TINY_SAC = dataclasses.replace(TINY, name="tiny-sac", config=SAC_CONFIG)
 FILE = Path("docs/study/tiny/seed-1.json")
 FOLDER = Path("runs/study/tiny/seed-1")
@@ -34,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere", "tiny")
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the study know tiny trainings."""
-    monkeypatch.setattr("agents.study.trainings.TRAININGS", (*TRAININGS, TINY, TINY_SAC))
+    monkeypatch.setattr("agents.study.trainings.TRAININGS", (*TRAININGS, TINY, TINY_USUAL, TINY_SAC))
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -43,9 +47,9 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     main()
 
 
-def run_tiny(monkeypatch: pytest.MonkeyPatch) -> Entry:
-    call(monkeypatch, "run", "tiny", "--seeds", "1", "--episodes", "2")
-    return entries.load(FILE)
+def run_tiny(monkeypatch: pytest.MonkeyPatch, name: str = "tiny") -> Entry:
+    call(monkeypatch, "run", name, "--seeds", "1", "--episodes", "2")
+    return entries.load(Path("docs/study") / name / FILE.name)
 
 
 def test_a_training_comes_to_its_record(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,15 +81,16 @@ def test_what_is_kept_is_not_done_again(monkeypatch: pytest.MonkeyPatch, capsys:
     assert files_of(Path()) == before
 
 
-def test_a_training_broken_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["tiny", "tiny-usual"])
+def test_a_training_broken_off_goes_on(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         Interrupter(patch, 40)
         with pytest.raises(KeyboardInterrupt):
-            run_tiny(monkeypatch)
-    assert not FILE.exists()
-    begun = work.checkpoints(FOLDER)[-1].name
+            run_tiny(monkeypatch, name)
+    assert not (Path("docs/study") / name).exists()
+    begun = work.checkpoints(Path("runs/study") / name / "seed-1")[-1].name
     assert 0 < int(begun.removeprefix("step-")) < 512
-    entry = run_tiny(monkeypatch)
+    entry = run_tiny(monkeypatch, name)
     assert entry.training is not None
     assert entry.training.steps >= 512
     assert entry.training.curve.steps[0] < int(begun.removeprefix("step-")), "what was before the break is told too"
