@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from agents.sb3_vec import threads_for
+from magenv.actions import PLANAR
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.params import require
 
@@ -26,6 +26,15 @@ POSITION_UNIT_MM, HEADING_UNIT_DEG = 1.0, 5.0
 """Errors that weigh the same."""
 LOST_UNITS = 100.0
 """What the time after a loss weighs, in such errors: of policies that lose control, the better keeps it longer."""
+
+
+THREADS = 2
+"""That share the episodes where each action is solved for, which takes most of a step; elsewhere one is as fast."""
+
+
+def threads_for(settings: Settings) -> int:
+    """Return how many threads should share the episodes of an environment."""
+    return THREADS if settings.action in PLANAR else 1
 
 
 @dataclass(frozen=True)

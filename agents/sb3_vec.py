@@ -11,7 +11,7 @@ from numba import typeof
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from magenv.actions import PLANAR
+from agents.evaluation import threads_for
 from magenv.episodes import Episodes, Settings, check_action
 from magenv.kernels import kernel
 from magenv.poses import LANES
@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 Rewards = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
-THREADS = 2
-"""That share the episodes where each action is solved for, which takes most of a step; elsewhere one is as fast."""
 EPISODE_KEYS = Measurements.NUMBERS[:2]
 """Means over each episode that its last info carries beside ``is_success``."""
 
@@ -52,11 +50,6 @@ def add_rows(s: State, sums: Floats, ends: Floats, rewards: Rewards, dones: Bool
             sums[i] = 0.0
             count += 1
     return count
-
-
-def threads_for(settings: Settings) -> int:
-    """Return how many threads should share the episodes of an environment."""
-    return THREADS if settings.action in PLANAR else 1
 
 
 def _types(*arguments: object) -> tuple[object, ...]:

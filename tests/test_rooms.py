@@ -172,6 +172,7 @@ def test_torch_is_for_training_alone() -> None:
         "networks",
         "sb3_vec",
         "residual_vec",
+        "cloning",
         "checkpoints",
         "keeper",
         "progress",
