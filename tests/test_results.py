@@ -14,9 +14,14 @@ from magenv.params import PLANTS
 EPISODES = 20
 """As many as ``evaluate.py`` runs."""
 
+SETTINGS = {"steered-ppo-three": (3, 2.0), "steered-ppo-10hz": (2, 10.0)}
+"""EPMs and control rate of agents that are not made for two at 2 Hz."""
+
 
 def summary(name: str, scenario: str, episodes: int) -> Summary:
-    (row,) = summarise(run(controller(name), scenario, episodes=episodes))
+    n_epm, control_hz = SETTINGS.get(name, (2, 2.0))
+    agent = controller(name, n_epm, control_hz)
+    (row,) = summarise(run(agent, scenario, n_epm=n_epm, control_hz=control_hz, episodes=episodes))
     return row
 
 
@@ -27,9 +32,15 @@ def summary(name: str, scenario: str, episodes: int) -> Summary:
         ("ppo", "approach-30", 1.2, 4),
         ("home-ppo", "approach-60", 1.5, 16.7),
         ("home-ppo", "approach-30", 4, 30),
+        ("steered-ppo", "approach-60", 0.25, 0.5),
+        ("steered-ppo", "approach-30", 0.6, 1.5),
+        ("steered-ppo-three", "approach-60", 0.25, 0.5),
+        ("steered-ppo-three", "approach-30", 0.6, 1.5),
+        ("steered-ppo-10hz", "approach-30", 0.6, 1.5),
+        ("steered-ppo-10hz", "approach-22.5", 0.6, 1.5),
     ],
 )
-def test_the_shipped_agents_hold_both_scenarios(
+def test_the_shipped_agents_hold_what_they_are_shipped_for(
     name: str, scenario: str, position_mm: float, heading_deg: float
 ) -> None:
     row = summary(name, scenario, EPISODES)

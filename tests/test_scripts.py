@@ -19,6 +19,7 @@ import pytest
 from tiny_runs import OPTIONS
 
 from agents.checkpoints import checkpoints, stored_config
+from agents.classical import CLASSICAL
 from agents.learned import Learned
 from agents.learning import train
 from agents.store import load_card
@@ -133,7 +134,8 @@ def test_evaluate_lists_its_controllers(tmp_path: Path) -> None:
     done = call(tmp_path, "evaluate.py", "--list")
     assert (done.returncode, done.stderr) == (0, "")
     listed = done.stdout.splitlines()
-    assert listed[:7] == ["baseline", "tuned", "predictive", "predictive-robust", "steered", "idle", "random"]
+    assert listed[: len(CLASSICAL)] == list(CLASSICAL)
+    assert {"ppo", "home-ppo", "steered-ppo"} <= set(listed)
     assert len(set(listed)) == len(listed)
     assert not list(tmp_path.iterdir())
 
@@ -145,7 +147,8 @@ def test_evaluate_leaves_out_agents_made_for_another_system(
     asked = ["--n-epm", "3", "--episodes", "1", "--scenarios", "approach-60"]
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *asked])
     runpy.run_path(str(ROOT / "evaluate.py"), run_name="__main__")
-    assert [row["controller"] for row in summary(tmp_path / "runs" / "evaluate")] == ["baseline", "tuned"]
+    names = [row["controller"] for row in summary(tmp_path / "runs" / "evaluate")]
+    assert names == ["baseline", "tuned", "steered-ppo-three"]
     assert re.search(r"left out: ppo \(Input n_epm for ppo must be 2.*received 3", capfd.readouterr().err)
 
 
