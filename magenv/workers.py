@@ -41,7 +41,8 @@ class Workers:
         if self._pool is None or self._owner != os.getpid():  # threads do not survive a fork
             self._pool, self._owner = ThreadPoolExecutor(self.threads - 1, "magenv"), os.getpid()
         share = math.ceil(rows / self.threads)
-        parts = itertools.pairwise([*range(0, rows, min(share, self._at_once or share)), rows])
+        ends = [*range(0, rows, min(share, self._at_once or share)), rows]
+        parts = iter([*itertools.pairwise(ends)])  # a list's iterator, which no thread can leave between two steps
 
         def work() -> None:
             for first, last in parts:  # one iterator for all: each part is taken once
