@@ -113,7 +113,7 @@ class CloningConfig:
     rounds: int = 10
     """After each, the policy is fitted to all that the controller has answered so far."""
     steps: int = 64
-    """Of each episode in a round."""
+    """Of each environment in a round; episodes go on into the next."""
     led: int = 5
     """Rounds in which the controller still acts in some episodes: in all of the first, then in ever fewer."""
     epochs: int = 10
@@ -121,7 +121,7 @@ class CloningConfig:
     batch_size: int = 256
     """Samples of a gradient step."""
     learning_rate: float = 1e-3
-    """At the start; it falls linearly to a tenth in the last round."""
+    """In the first round; each of the others takes as much off, such that a tenth is left after the last."""
 
     def __post_init__(self) -> None:
         _whole(1, 65_536, rounds=self.rounds, steps=self.steps, epochs=self.epochs)
