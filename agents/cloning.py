@@ -8,6 +8,7 @@ which follows, would not keep what was cloned if its critic knew nothing.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from agents.configs import TrainConfig
 from agents.residual import seen_by, teacher
 from agents.rollout import controller_seed
 from magenv.files import write_file
-from magenv.params import InputError, require
+from magenv.params import InputError, is_whole, require
 
 ANSWERS = "answers.safetensors"
 """What the controller has answered, in the run's folder: a run that is gone on with needs not ask again."""
@@ -45,6 +46,11 @@ class Answers:
     """(m, a) of the controller."""
     rounds: int = 0
 
+    @classmethod
+    def none(cls, observations: int, actions: int) -> Answers:
+        """Return those of no round, of so many numbers each."""
+        return cls(np.empty((0, observations), np.float32), np.empty((0, actions), np.float32))
+
     def save(self, folder: Path) -> None:
         """Write them into a run's folder."""
         rounds = np.array([self.rounds])
@@ -53,24 +59,26 @@ class Answers:
 
     @classmethod
     def load(cls, folder: Path, observations: int, actions: int) -> Answers:
-        """Return those of a run's folder, none where there are none, of so many numbers each.
+        """Return those of a run's folder, of so many numbers each.
 
         Raises
         ------
         InputError
-            If they are damaged, or of another environment.
+            If there are none, or they are damaged, or of another environment.
         """
-        path = folder / ANSWERS
-        if not path.is_file():
-            return cls(np.empty((0, observations), np.float32), np.empty((0, actions), np.float32))
         try:
-            found = load_file(path)
-            told = cls(found["observations"], found["actions"], int(found["rounds"][0]))
-        except (OSError, SafetensorError, KeyError, IndexError) as error:
+            found = load_file(folder / ANSWERS)
+            told = cls(found["observations"], found["actions"], found["rounds"].item())
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
             raise InputError(f"Input resume must be a run with sound {ANSWERS}; instead received {error}.") from error
-        shapes = (told.observations.shape, told.actions.shape)
-        fits = shapes == ((len(told.actions), observations), (len(told.actions), actions))
+        arrays = (told.observations, told.actions)
+        shapes, m = tuple(array.shape for array in arrays), told.actions.shape[:1]
+        fits = len(m) == 1 and shapes == ((*m, observations), (*m, actions))
         require(fits, ANSWERS, f"of shapes (m, {observations}) and (m, {actions})", shapes)
+        sound = all(array.dtype == np.float32 and bool(np.isfinite(array).all()) for array in arrays)
+        require(sound, ANSWERS, "of finite numbers in single precision", [str(array.dtype) for array in arrays])
+        counted = is_whole(told.rounds) and told.rounds >= 0 and (told.rounds > 0) == (m > (0,))
+        require(counted, ANSWERS, "of whole rounds", told.rounds)
         return told
 
     def add(self, observations: list[Floats], actions: list[Floats]) -> None:
@@ -80,7 +88,9 @@ class Answers:
         self.rounds += 1
 
 
-def clone(config: TrainConfig, model: PPO, env: VecNormalize, callbacks: CallbackList) -> None:
+def clone(
+    config: TrainConfig, model: PPO, env: VecNormalize, callbacks: CallbackList, keep: Callable[[], None]
+) -> None:
     """Fit the policy to the controller, in as many rounds as the run lacks; its steps are counted as training.
 
     Parameters
@@ -93,16 +103,19 @@ def clone(config: TrainConfig, model: PPO, env: VecNormalize, callbacks: Callbac
         The environments of the training.
     callbacks : CallbackList
         Are told every step, as in training.
+    keep : callable
+        Writes a checkpoint, after each round: no policy is gone on with that was not fitted to all answers kept.
 
     Raises
     ------
     InputError
-        If the answers kept of a run gone on with are damaged.
+        If the answers of a run gone on with are missing or damaged.
     """
     assert config.expert is not None
     expert = teacher(config.expert, config.settings, "cloned")
     sizes = [int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space)]
-    answers = Answers.load(config.resume or config.folder, *sizes)
+    answers = Answers.none(*sizes) if config.resume is None else Answers.load(config.resume, *sizes)
+    answers.save(config.folder)  # those of a run gone on with elsewhere; none in the place of what a killed run left
     todo = range(answers.rounds, config.cloning.rounds)
     if not todo:
         return
@@ -135,9 +148,10 @@ def clone(config: TrainConfig, model: PPO, env: VecNormalize, callbacks: Callbac
         for group in optimiser.param_groups:
             group["lr"] = config.cloning.learning_rate * (1.0 - 0.9 * number / config.cloning.rounds)
         losses = _fit(config, model, env, optimiser, answers, np.concatenate(observations), returns)
-        answers.save(config.folder)
         for name, loss in zip(("clone_loss", "value_loss"), losses, strict=True):
             model.logger.record(f"train/{name}", loss)
+        keep()
+        answers.save(config.folder)
         model.logger.record("time/time_elapsed", time.monotonic() - begun)
         model.logger.record("time/total_timesteps", model.num_timesteps)
         model.logger.dump(model.num_timesteps)

@@ -66,7 +66,7 @@ class Keeper(BaseCallback):
         if self.num_timesteps >= self._next_checkpoint:
             self._next_checkpoint += self._config.checkpoint_steps
             self._judge()
-            self._checkpoint()
+            self._checkpoint(self.score)
             if self._watch is not None and self.score is not None:
                 self._watch(self.score)
         return True
@@ -75,8 +75,13 @@ class Keeper(BaseCallback):
         """Judge and store the last policy, as ``model`` and as a checkpoint to go on from."""
         self.check()
         self._judge()
-        self._save(self._config.folder / MODEL, False)
-        self._checkpoint()
+        self._save(self._config.folder / MODEL, False, self.score)
+        self._checkpoint(self.score)
+
+    def keep(self) -> None:
+        """Write a checkpoint out of turn, of a policy that nobody has judged."""
+        self.check()
+        self._checkpoint(None)
 
     def check(self) -> None:
         """Raise ``DivergedError`` unless parameters, losses and the actions for the last observations are finite."""
@@ -119,7 +124,7 @@ class Keeper(BaseCallback):
             self.logger.record(f"eval/{name}", value)
         if self._best is None or self.score.merit > self._best.merit:
             # Before the checkpoint: a run gone on with from there has been judged up to there.
-            self._save(self._config.folder / BEST, False)
+            self._save(self._config.folder / BEST, False, self.score)
             self._best = self.score
 
     def _policy(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -145,17 +150,17 @@ class Keeper(BaseCallback):
 
         return predict
 
-    def _checkpoint(self) -> None:
+    def _checkpoint(self, score: Score | None) -> None:
         """Write a checkpoint; drop all but the run's last two, and what was left half written."""
         folder = self._config.folder / "checkpoints" / f"step-{self.model.num_timesteps:012d}"
-        self._save(folder, True)
+        self._save(folder, True, score)
         kept = checkpoints(self._config.folder)[-KEPT_CHECKPOINTS:]
         for other in folder.parent.iterdir():
             if other.is_dir() and other.name.startswith("step-") and other not in kept:
                 shutil.rmtree(other)
 
-    def _save(self, folder: Path, with_training: bool) -> None:
+    def _save(self, folder: Path, with_training: bool, score: Score | None) -> None:
         try:
-            save_model(folder, self.model, self._env, self._config, with_training, self._command, self.score)
+            save_model(folder, self.model, self._env, self._config, with_training, self._command, score)
         except NotFiniteError as error:  # an optimiser's averages, which squares overflow first
             raise self.diverged("optimisers are not finite") from error

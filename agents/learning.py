@@ -159,7 +159,7 @@ def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command
         try:
             if config.expert is not None:
                 assert isinstance(model, PPO)
-                clone(config, model, env, CallbackList(callbacks))
+                clone(config, model, env, CallbackList(callbacks), keeper.keep)
             interval = 1 if config.algo == "ppo" else 50
             model.learn(
                 config.total_steps - model.num_timesteps, callbacks, reset_num_timesteps=False, log_interval=interval

@@ -24,6 +24,7 @@ from agents.learning import build, train
 from agents.residual import seen_by, teacher
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.steered import Steered
+from agents.store import load_policy
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -124,6 +125,38 @@ def test_the_same_seed_clones_to_the_same_bits(tmp_path: Path) -> None:
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
+def test_what_a_killed_run_left_is_none_of_a_new_one(tmp_path: Path) -> None:
+    fresh, _ = train(dataclasses.replace(TINY, out=tmp_path / "fresh"))
+    left = tmp_path / "anew"
+    left.mkdir()
+    Answers(np.ones((ROUND, 63), np.float32), np.ones((ROUND, 6), np.float32), TINY.cloning.rounds).save(left)
+    anew, _ = train(dataclasses.replace(TINY, out=left))
+    first, second = tensors_of(fresh), tensors_of(anew)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_run_gone_on_with_elsewhere_takes_its_answers_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(dataclasses.replace(TINY, out=tmp_path / "run"))
+    train(going_on(tmp_path / "run", out=tmp_path / "there", steps=5 * ROUND))
+    assert (tmp_path / "there" / ANSWERS).read_bytes() == (tmp_path / "run" / ANSWERS).read_bytes()
+    monkeypatch.setattr(cloning, "_fit", None)  # nothing is left to do
+    train(going_on(tmp_path / "there", steps=6 * ROUND))
+
+
+def test_a_checkpoint_never_lacks_a_fit_that_its_run_holds_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However rare checkpoints are: else a run killed after cloning would go on with a policy that was not cloned."""
+    alone, _ = train(dataclasses.replace(TINY, steps=3 * ROUND, out=tmp_path / "alone"))
+    monkeypatch.setattr(PPO, "learn", lambda *_, **__: (_ for _ in ()).throw(BrokenOffError))
+    for every, name in ((10**6, "rare"), (ROUND + 8, "odd")):
+        with pytest.raises(BrokenOffError):
+            train(dataclasses.replace(TINY, checkpoint_every=every, out=tmp_path / name))
+        weights, _ = load_policy(checkpoints(tmp_path / name)[-1])
+        wanted, _ = load_policy(alone / "model")
+        assert all(np.array_equal(weights[key], wanted[key]) for key in wanted)
+
+
 def test_returns_are_discounted_sums_up_to_the_end_of_an_episode() -> None:
     model, _ = build(TINY)
     assert isinstance(model, PPO)
@@ -152,6 +185,18 @@ def test_damaged_answers_are_refused(tmp_path: Path) -> None:
     save_file(kept | {"actions": kept["actions"][:, :5].copy()}, path)
     told = refusal(lambda: train(going_on(tmp_path / "run")))
     assert f"of shapes (m, 63) and (m, 6); instead received (({ROUND}, 63), ({ROUND}, 5))" in told
+    for bad in (
+        kept | {"rounds": np.array([-1])},
+        kept | {"rounds": np.array([0.5])},
+        kept | {"actions": kept["actions"].astype(np.float64)},
+        kept | {"observations": np.full_like(kept["observations"], np.nan)},
+        {name: array for name, array in kept.items() if name != "rounds"},
+        {name: np.array(0.0) for name in kept},
+    ):
+        save_file(bad, path)
+        assert ANSWERS in refusal(lambda: train(going_on(tmp_path / "run")))
+    path.unlink()
+    assert "must be a run with sound answers.safetensors" in refusal(lambda: train(going_on(tmp_path / "run")))
     assert checkpoints(tmp_path / "run")
 
 
