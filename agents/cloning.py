@@ -158,7 +158,11 @@ def clone(
 
 
 def _returns(model: PPO, rewards: Floats, dones: NDArray[np.bool_], last: Any) -> Floats:
-    """Return the discounted returns (T, n) of a round, at its end those that the value function foretells."""
+    """Return the discounted returns (T, n) of a round, at its end those that the value function foretells.
+
+    Nothing is reckoned with beyond an episode's end, a time limit included: learning by reward mends what that leaves
+    out of the last steps.
+    """
     with torch.no_grad():
         after = model.policy.predict_values(torch.from_numpy(last)).numpy()[:, 0]
     returns = np.empty(rewards.shape, np.float32)

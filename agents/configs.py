@@ -124,8 +124,9 @@ class CloningConfig:
     """In the first round; each of the others takes as much off, such that a tenth is left after the last."""
 
     def __post_init__(self) -> None:
-        _whole(1, 65_536, rounds=self.rounds, steps=self.steps, epochs=self.epochs)
-        _whole(0, self.rounds, led=self.led)
+        _whole(1, 65_536, rounds=self.rounds, epochs=self.epochs)
+        _whole(1, 65_536, **{"cloning.steps": self.steps})
+        _whole(0, 65_536, led=self.led)
         _whole(2, math.inf, batch_size=self.batch_size)
         _number(0, math.inf, learning_rate=self.learning_rate)
 
@@ -200,7 +201,8 @@ class TrainConfig:
             require(self.residual is None, "expert", "given without --residual", self.residual)
             teacher(self.expert, self.settings, "cloned")
             asked = self.cloning.rounds * self.cloning.steps * self.ppo.n_envs
-            require(self.total_steps >= asked, "steps", f"at least {asked}, those of cloning", self.total_steps)
+            enough = self.total_steps >= asked or self.resume is not None  # which has asked before
+            require(enough, "steps", f"at least {asked}, those of cloning", self.total_steps)
 
     @property
     def correction(self) -> Correction | None:

@@ -162,8 +162,9 @@ def test_controllers_are_measured_and_kept(monkeypatch: pytest.MonkeyPatch, caps
         assert entry.training is None
         assert entry.outcomes == {SCENARIO: entries.outcomes_of(run(controller(entry.name), SCENARIO, episodes=1))}
     monkeypatch.setattr(work, "run_shared", None)
-    call(monkeypatch, "controllers", "idle", "ppo")
+    call(monkeypatch, "controllers", "idle", "ppo", "--scenarios", SCENARIO)
     assert capsys.readouterr().out == "".join(f"kept: {file}\n" for file in files)
+    assert "as kept in" in refusal(lambda: call(monkeypatch, "controllers", "idle", "--scenarios", "approach-60"))
 
 
 def test_a_controller_is_kept_once_per_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,7 +198,8 @@ def run_controller(name: str, setting: Setting, where: Where, scenarios: Sequenc
     check_controllers([name], where, scenarios)
     path = setting.store / entries.controller_file(name, where)
     if path.exists():
-        entries.load(path)
+        kept = tuple(entries.load(path).outcomes)
+        require(kept == tuple(scenarios), "scenarios", f"{kept}, as kept in {path}", tuple(scenarios))
         return f"kept: {path}"
     controller = catalogue.controller(name, where.n_epm, where.control_hz, where.plant)
     return _measure(controller, name, None, where.plant, where.n_epm, where.control_hz, scenarios, setting)
