@@ -128,6 +128,12 @@ def test_ablations_stand_beside_the_main_agents_of_their_algorithm(page: Path) -
         assert list(table) == ["", "ppo-home", "short-errors"]
 
 
+def test_a_store_of_lost_episodes_alone_is_told(tmp_path: Path) -> None:
+    entries.save(an_entry("idle", hold=0.0), tmp_path / "store")
+    page = report.write_results(tmp_path / "store", tmp_path / "page")
+    assert tables(page, "Agents and controllers")[0]["idle"] == ["-", *["0"] * len(SCENARIOS)]
+
+
 def test_other_environments_are_told_apart(tmp_path: Path) -> None:
     """Controllers stand beside the agents of their environment, and agents are compared with those alone."""
     a_store(tmp_path / "store", {"ppo-home": 1, "arm-home": 2}, ("tuned",))

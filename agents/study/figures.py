@@ -59,11 +59,11 @@ def overview(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
                 axes.plot(at, values, mark, color=colour, markersize=4, alpha=0.5, markeredgewidth=0)
                 if len(values):
                     axes.plot(at[:1], [np.median(values)], mark, color=colour, markersize=8, markeredgewidth=0)
-        for border in range(1, len(scenarios)):
-            axes.axvline(border - 0.5, color=_GRID, linewidth=1.0)
-        if title != rows[0][0]:
+        if title != rows[0][0] and any(len(line.get_xdata()) > 0 for line in axes.lines):  # else all were lost
             axes.set_yscale("log")
             _plain_numbers(axes.yaxis)
+        for border in range(1, len(scenarios)):
+            axes.axvline(border - 0.5, color=_GRID, linewidth=1.0)
         axes.set_ylabel(title, fontsize=11)
         axes.grid(axis="y", color=_GRID, linewidth=0.6)
         axes.set_axisbelow(True)
