@@ -62,10 +62,9 @@ def main() -> None:
         print("\n".join(names()))
         return
     require(not c.robustness or c.ladder == "none", "robustness", "without --ladder", f"--ladder {c.ladder}")
+    unfit: list[str] = []
     if c.controllers is None:
         chosen, unfit = defaults(c.n_epm, c.control_hz)
-        for reason in unfit:
-            print(f"left out: {reason}", file=sys.stderr)
     else:
         chosen = [controller(name, c.n_epm, c.control_hz, c.plant) for name in c.controllers]
     if c.robustness:
@@ -80,6 +79,8 @@ def main() -> None:
     else:
         ladder = Ladder(c.plant, c.n_epm, c.control_hz, c.ladder == "anti", c.episodes, c.seed)
         run_ladder(chosen, ladder, c.jobs, c.out or Path("runs/ladder"), command_line())
+    for reason in unfit:
+        print(f"left out: {reason}", file=sys.stderr)
 
 
 if __name__ == "__main__":
