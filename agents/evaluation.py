@@ -26,8 +26,6 @@ POSITION_UNIT_MM, HEADING_UNIT_DEG = 1.0, 5.0
 """Errors that weigh the same."""
 LOST_UNITS = 100.0
 """What the time after a loss weighs, in such errors: of policies that lose control, the better keeps it longer."""
-
-
 THREADS = 2
 """That share the episodes where each action is solved for, which takes most of a step; elsewhere one is as fast."""
 
