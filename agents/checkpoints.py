@@ -71,7 +71,7 @@ def save_model(
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
-        dataclasses.replace(card, command=command, score=score, residual=config.correction),
+        dataclasses.replace(card, command=command, score=score, residual=config.correction, history=config.history),
         flatten(dict(model.policy.state_dict())),
         Normalisation(statistics.mean, statistics.var, statistics.count),
         training,

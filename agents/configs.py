@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.classical import CLASSICAL
+from agents.history import check_history
 from agents.residual import Correction, teacher
 from magenv.actions import ActionMode
 from magenv.episodes import Settings
@@ -156,6 +157,9 @@ class TrainConfig:
     """Frame of the observation: robots or global."""
     control_hz: float = 2.0
     """Control rate."""
+    history: int = 1
+    """How many of its episode's last observations the agent sees, side by side; one where it is to correct or to clone
+    a controller."""
     residual: str | None = None
     """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
     residual_scale: float = 0.1
@@ -194,7 +198,10 @@ class TrainConfig:
         if self.trials is not None:
             require(self.tune, "trials", "given with --tune", self.trials)
             _whole(1, math.inf, trials=self.trials)
+        check_history(self.history)
         _ = self.correction  # which checks what it is made of
+        alone = self.residual is None and self.expert is None
+        require(alone or self.history == 1, "history", "1 with --residual or --expert", self.history)
         if self.expert is not None:
             require(self.expert in CLASSICAL, "expert", f"one of {', '.join(CLASSICAL)}", self.expert)
             require(self.algo == "ppo", "algo", "ppo with --expert", self.algo)

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.checkpoints import BEST, MODEL, best_so_far, checkpoints, save_model
 from agents.configs import TrainConfig
 from agents.evaluation import EPISODES, EPISODES_CORRECTED, SEED, HeldOut, Score
+from agents.history import Recalling
 from agents.residual import Corrected
 from agents.rollout import controller_seed
 from agents.store import NotFiniteError
@@ -134,11 +135,15 @@ class Keeper(BaseCallback):
         return self._mode(normalised)
 
     def _acting(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        """Return what acts in episodes that all begin at its first call: the policy, or what it corrects with it."""
-        correction = self._config.correction
-        if correction is None:
+        """Return what acts in episodes that all begin at its first call: the policy with all that it goes with."""
+        correction, history = self._config.correction, self._config.history
+        whole: Corrected | Recalling
+        if correction is not None:
+            whole = Corrected(correction.base(self._config.settings), self._policy, correction.scale)
+        elif history > 1:
+            whole = Recalling(self._policy, history)
+        else:
             return self._policy
-        whole = Corrected(correction.base(self._config.settings), self._policy, correction.scale)
         whole.seed(controller_seed(SEED))
         state, begin = None, True
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import Actions, Observations
+from agents.history import Recalling
 from agents.player import Player
 from agents.residual import Corrected
 from agents.store import load_card, load_policy
@@ -40,12 +41,14 @@ class Learned:
         episodes = Episodes(1, card.settings)
         self._size, outputs = episodes.layout.size, episodes.actions.size
         told, correction = card.algo, card.residual
-        inputs = self._size if correction is None else self._size + outputs
+        inputs = card.history * self._size if correction is None else self._size + outputs
         self._player = Player(card, *load_policy(folder), inputs, outputs)
-        self._corrected: Corrected | None = None
+        self._whole: Corrected | Recalling | None = None
         if correction is not None:
             told = f"{correction.controller}-{card.algo}"
-            self._corrected = Corrected(correction.base(card.settings), self._player, correction.scale)
+            self._whole = Corrected(correction.base(card.settings), self._player, correction.scale)
+        elif card.history > 1:
+            self._whole = Recalling(self._player, card.history)
         self.name = name or told
         self.action = card.settings.action
         self.observation = card.settings.observation
@@ -53,8 +56,8 @@ class Learned:
 
     def seed(self, seed: int) -> None:
         """Seed the controller that is corrected; the policy's mode has no randomness."""
-        if self._corrected is not None:
-            self._corrected.seed(seed)
+        if self._whole is not None:
+            self._whole.seed(seed)
 
     def check(self, n_epm: int, control_hz: float) -> None:
         """Raise ``ValueError`` unless the policy was made for this number of EPMs and control rate."""
@@ -74,13 +77,14 @@ class Learned:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Actions, Any]:
-        """Return actions (n, a) or (a,) for observations (n, d) or (d,), and the state of the controller corrected.
+        """Return actions (n, a) or (a,) for observations (n, d) or (d,), and the state.
 
-        Where there is none, there is no state. ``deterministic`` changes nothing.
+        That is the state of the controller corrected, or the observations that the policy remembers; others have none.
+        ``deterministic`` changes nothing.
         """
         shape = np.shape(observation)
         fits = len(shape) in (1, 2) and shape[-1] == self._size
         require(fits, f"observation for {self.name}", f"of shape ({self._size},) or (n, {self._size})", shape)
-        if self._corrected is None:
+        if self._whole is None:
             return self._player(observation), None
-        return self._corrected.predict(observation, state, episode_start, deterministic)
+        return self._whole.predict(observation, state, episode_start, deterministic)

@@ -21,6 +21,7 @@ from agents.checkpoints import MODEL, check_goes_on, is_run, restore
 from agents.cloning import clone
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.folders import lock_folder, new_folder
+from agents.history_vec import HistoryVecEnv
 from agents.keeper import Keeper, Watch
 from agents.networks import policy_kwargs
 from agents.player import CLIP_OBSERVATION
@@ -44,6 +45,8 @@ def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
     robots: VecEnv = TwoRobotsVecEnv(own.n_envs, config.settings, config.seed)
     if config.correction is not None:
         robots = ResidualVecEnv(robots, config.correction.base(config.settings), config.correction.scale)
+    if config.history > 1:
+        robots = HistoryVecEnv(robots, config.history)
     env = VecNormalize(robots, norm_reward=False, clip_obs=CLIP_OBSERVATION)
     kwargs = policy_kwargs(config.algo, own.net)
     if isinstance(own, PPOConfig):

@@ -125,6 +125,8 @@ def _check(card: Card, weights: Mapping[str, NDArray[Any]], inputs: int, outputs
         environment = f"observation {s.observation!r}, action {s.action!r}, n_epm {s.n_epm}"
         if card.residual is not None:
             environment += f", and it corrects {card.residual.controller}"
+        if card.history > 1:
+            environment += f", and it sees {card.history} observations"
         raise InputError(
             f"Input model must be weights for sizes [{inputs}, {outputs}] of observation and action, as its card tells "
             f"({environment}); instead received weights for {sizes}."

@@ -25,6 +25,7 @@ from safetensors.numpy import save_file
 
 from agents.configs import check_net
 from agents.evaluation import Score
+from agents.history import check_history
 from agents.residual import Correction
 from magenv.episodes import Settings
 from magenv.params import InputError, require
@@ -58,6 +59,8 @@ class Card:
     """On the held-out episodes of its training; None where it was not judged, as before there were any."""
     residual: Correction | None = None
     """What the policy corrects; None where it acts by itself."""
+    history: int = 1
+    """How many of its episode's last observations it sees."""
 
     @classmethod
     def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
@@ -165,6 +168,7 @@ def load_card(folder: Path) -> Card:
     except (KeyError, TypeError) as error:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
     check_net(card.net)
+    check_history(card.history)
     for name, value, kind in (
         ("algo", card.algo, str),
         ("steps", card.steps, int),
@@ -176,7 +180,8 @@ def load_card(folder: Path) -> Card:
     made, own = card.versions.get("magenv"), version("magenv")
     same = isinstance(made, str) and made.split(".")[0] == own.split(".")[0]
     require(same, "model", f"of the major version of magenv {own}", made)
-    for name, value in dataclasses.asdict(card.settings).items():  # a mode of the same size would go unnoticed
+    bound = dataclasses.asdict(card.settings) | {"history": card.history}
+    for name, value in bound.items():  # a mode of the same size would go unnoticed
         trained = card.config.get(name)
         require(trained in (None, value), f"model's {name}", f"{trained!r}, as in its training", value)
     return card
