@@ -106,6 +106,12 @@ TRAININGS = (
         group="ablation: observation",
     ),
     Training(
+        "ppo-errors",
+        "pose errors alone, in as many steps as `ppo-velocity`",
+        TrainConfig(observation="errors"),
+        group="ablation: observation",
+    ),
+    Training(
         "short-one",
         "one scenario alone, `approach-30`, instead of the random family",
         TrainConfig(scenario="approach-30", steps=SHORT),
@@ -129,6 +135,13 @@ TRAININGS = (
         "arm-home",
         "PPO by offsets from the home configuration, trained on `arm`, where all parameters are drawn anew",
         TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
+        group="arms",
+        scenarios=("approach-60", "approach-30"),
+    ),
+    Training(
+        "arm-history",
+        "`arm-home` that sees its last four observations",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm", history=4),
         group="arms",
         scenarios=("approach-60", "approach-30"),
     ),
