@@ -246,6 +246,23 @@ def test_curves_are_medians_between_the_extremes(store: Path) -> None:
     assert line.get_xdata()[-1] == pytest.approx(3000.0)
 
 
+def test_a_training_whose_first_steps_took_no_second_is_drawn_over_time(store: Path) -> None:
+    (one,) = (one for one in collect(store) if one.name == "ppo-home")
+    entries = []
+    for entry in one.entries:
+        assert entry.training is not None
+        curve = entry.training.curve
+        quick = dataclasses.replace(curve, seconds=(0.0, 0.0, *curve.seconds[2:]))
+        entries.append(dataclasses.replace(entry, training=dataclasses.replace(entry.training, curve=quick)))
+    for axes, first in zip(
+        curves([dataclasses.replace(one, entries=tuple(entries))], "main").axes[:2], (1, 2), strict=True
+    ):
+        (line,) = axes.lines
+        begun = [made.curve for made in one.made]
+        told = [curve.seconds[2] / 60 if first == 2 else curve.steps[0] / 1e3 for curve in begun]
+        assert line.get_xdata()[0] == pytest.approx(max(told))
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_ladder_is_drawn_on_demand(store: Path, climbed: Climbed, rollout: Told, tmp_path: Path) -> None:
     run_ladder([controller("tuned")], Ladder(), 1, tmp_path / "ladder", "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -200,8 +201,9 @@ def curves(measured: Sequence[Measured], group: str) -> Figure:
 
 def _curve(axes: Axes, series: Sequence[tuple[Sequence[float], Sequence[float]]], line: dict[str, object]) -> None:
     """Draw median and range of several seeds where all of them have begun and none has ended."""
-    begin, end = max(at[0] for at, _ in series), min(at[-1] for at, _ in series)
-    if not 0 < begin < end:
+    begun = [next((one for one in at if one > 0.0), math.inf) for at, _ in series]  # quick ones begin after no seconds
+    begin, end = max(begun), min(at[-1] for at, _ in series)
+    if not begin < end:
         return
     grid = np.geomspace(begin, end, _POINTS)
     values = np.array([np.interp(grid, at, value) for at, value in series])
@@ -211,7 +213,7 @@ def _curve(axes: Axes, series: Sequence[tuple[Sequence[float], Sequence[float]]]
 
 def _plain_numbers(axis: Axis) -> None:
     """Write no powers of ten on a logarithmic axis, and more than one number a decade."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
     axis.set_minor_formatter(NullFormatter())
 
