@@ -69,6 +69,7 @@ def search(config: TrainConfig) -> Path:
     """
     optuna = _optuna()
     Episodes(1, config.settings)
+    _shortened(config)
     folder, lock = new_folder(config.out, DEFAULT_FOLDER, _is_taken, "a folder without a search or a run")
     try:
         return _search(optuna, config, folder)
@@ -115,13 +116,19 @@ def _search(optuna: Any, config: TrainConfig, folder: Path) -> Path:
     return folder
 
 
+def _shortened(config: TrainConfig) -> TrainConfig:
+    """Return the training of a trial; raises where so few steps are too few for it."""
+    steps = max(1, config.total_steps // SHARE)
+    return dataclasses.replace(config, tune=False, trials=None, steps=steps, checkpoint_every=None)
+
+
 def _try(optuna: Any, study: optuna.Study, config: TrainConfig, folder: Path) -> Trial:
     """Train with the hyperparameters that the study asks for next, and tell it what they reach."""
     trial = study.ask()
     own: Any = suggested(trial, config.ppo if config.algo == "ppo" else config.sac)
     whole = dataclasses.replace(config, tune=False, trials=None, out=None, **{config.algo: own})
     out, scores = folder / f"trial-{trial.number:03d}", 0
-    short = dataclasses.replace(whole, out=out, steps=max(1, whole.total_steps // SHARE), checkpoint_every=None)
+    short = dataclasses.replace(_shortened(whole), out=out)
 
     def watch(score: Score) -> None:
         nonlocal scores

@@ -195,3 +195,10 @@ def test_without_optuna_it_is_told_how_to_install_it(make_config: MakeConfig, mo
 def test_an_unsound_configuration_is_refused_before_anything_is_written(make_config: MakeConfig) -> None:
     assert "scenario" in refusal(lambda: search(make_config(tune=True, scenario="nowhere")))
     assert not make_config().out.exists()
+
+
+def test_trials_too_short_to_clone_are_refused_before_anything_is_written(make_config: MakeConfig) -> None:
+    """A tenth of the steps would not do for cloning, though all of them would."""
+    told = refusal(lambda: search(make_config(tune=True, expert="idle", steps=6000)))
+    assert told.startswith("Input steps must be at least 5120, those of cloning; instead received 600")
+    assert not make_config().out.exists()
