@@ -92,7 +92,7 @@ TRAININGS = (
     Training(
         "ppo-wrench",
         "wrenches that an optimiser allocates",
-        TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=1_000_000),
+        TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=300_000),
         group="ablation: action",
     ),
     Training("short", "`ppo-velocity` in fewer steps", TrainConfig(steps=SHORT), group="ablation: observation"),
