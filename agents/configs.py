@@ -16,6 +16,7 @@ from magenv.actions import ActionMode
 from magenv.episodes import Settings
 from magenv.params import require
 from magenv.task import Frame, ObservationMode
+from magenv.trajectories import FAMILY_MOST_MM, family_separation
 
 Algo = Literal["ppo", "sac"]
 _WIDTH_MAX, _DEPTH_MAX = 4096, 8
@@ -143,7 +144,11 @@ class TrainConfig:
     algo: Algo = "ppo"
     """Learning algorithm."""
     scenario: str = "random"
-    """Trajectories trained on: random (the seeded family), or a shape as in evaluate.py."""
+    """Trajectories trained on: random (the seeded family), random-<s> (its like, whose robots come to s mm of each
+    other), or a shape as in evaluate.py."""
+    curriculum: float | None = None
+    """Separation (mm) that robots keep at first on a random family; it falls evenly to the family's own, where it comes
+    after half of all steps."""
     plant: str = "paper"
     """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
@@ -199,6 +204,11 @@ class TrainConfig:
             require(self.tune, "trials", "given with --tune", self.trials)
             _whole(1, math.inf, trials=self.trials)
         check_history(self.history)
+        if self.curriculum is not None:
+            own = family_separation(self.scenario)
+            require(own is not None, "scenario", "a random family with --curriculum", self.scenario)
+            assert own is not None
+            _number(1e3 * own, FAMILY_MOST_MM, curriculum=self.curriculum)
         _ = self.correction  # which checks what it is made of
         alone = self.residual is None and self.expert is None
         require(alone or self.history == 1, "history", "1 with --residual or --expert", self.history)
@@ -215,6 +225,14 @@ class TrainConfig:
     def correction(self) -> Correction | None:
         """What the policy corrects; None where it acts by itself."""
         return None if self.residual is None else Correction(self.residual, self.residual_scale)
+
+    @property
+    def curriculum_m(self) -> tuple[float, float]:
+        """The least separation (m) at first, and in the end; of a training with a curriculum."""
+        own = family_separation(self.scenario)
+        assert own is not None
+        assert self.curriculum is not None
+        return 1e-3 * self.curriculum, own
 
     @property
     def folder(self) -> Path:

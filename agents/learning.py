@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from agents.checkpoints import MODEL, check_goes_on, is_run, restore
 from agents.cloning import clone
 from agents.configs import PPOConfig, SACConfig, TrainConfig
+from agents.curriculum import Curriculum
 from agents.folders import lock_folder, new_folder
 from agents.history_vec import HistoryVecEnv
 from agents.keeper import Keeper, Watch
@@ -152,6 +153,8 @@ def _learn(config: TrainConfig, model: BaseAlgorithm, env: VecNormalize, command
         env.seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
         if isinstance(model, SAC):
             callbacks.append(_Refill(config.sac))
+    if config.curriculum is not None:
+        callbacks.append(Curriculum(config, env, model.num_timesteps))
     recover(config.folder / MODEL)
     check_replaceable(config.folder / MODEL)
     keeper = Keeper(model, config, env, command, watch)

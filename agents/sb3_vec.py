@@ -92,6 +92,10 @@ class TwoRobotsVecEnv(VecEnv):
         self._sums[...] = 0.0
         return self._episodes.start(self._all)
 
+    def set_nearest(self, nearest_m: float) -> None:
+        """See ``Episodes.set_nearest``."""
+        self._episodes.set_nearest(nearest_m)
+
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Keep the actions for ``step_wait``."""
         self._actions = actions

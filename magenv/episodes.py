@@ -19,13 +19,13 @@ from magenv.actions import PLANAR, ActionMode, Actions
 from magenv.forecast import STATE
 from magenv.params import InputError, System, TaskParams, is_whole, plant_named, require
 from magenv.poses import EPM_SIZE, LANES, POSE_SIZE
-from magenv.random_knots import RANDOM_EXTENT
+from magenv.random_knots import RANDOM_RADIUS_M
 from magenv.reach import Shell
 from magenv.starts import Starts, holding_epms
 from magenv.state import State, packed
 from magenv.steps import begin_episodes, clip, step_kernel, tell_rows
 from magenv.task import REWARD_TERMS, Frame, Layout, ObservationMode
-from magenv.trajectories import extent, named_trajectory
+from magenv.trajectories import FAMILY_MOST_MM, extent, family_separation, named_trajectory
 from magenv.uncertainty import is_uncertain, nominal
 from magenv.workers import Workers
 from magenv.world import Measurements, World, check_extent
@@ -96,7 +96,7 @@ class Episodes:
     def __init__(self, n: int, settings: Settings, threads: int = 1) -> None:
         require(is_whole(settings.n_epm) and settings.n_epm in (2, 3), "n_epm", "2 or 3", settings.n_epm)
         plant = self.plant = plant_named(settings.plant)
-        trajectory = named_trajectory(settings.scenario)
+        trajectory, nearest = named_trajectory(settings.scenario), family_separation(settings.scenario)
         self.settings = settings
         self.system = System(n_epm=settings.n_epm)
         self.task = TaskParams(control_hz=settings.control_hz)
@@ -106,14 +106,14 @@ class Episodes:
         self._workers = Workers(threads, LANES if settings.action in PLANAR else None)  # searches differ in length
         shell = Shell.of(self.system, plant)
         self.actions = Actions(settings.action, self.system, self._workers, shell, plant, self.task.period_s)
-        reach_and_gap = RANDOM_EXTENT if trajectory is None else extent(trajectory)
+        reach_and_gap = (RANDOM_RADIUS_M, nearest or 0.0) if trajectory is None else extent(trajectory)
         check_extent(reach_and_gap, plant, "scenario", f"{settings.scenario!r} on {settings.plant!r}")
         self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
         bounds = self.layout.bounds()
         self.observation_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.actions.size,), np.float32)
         self._shape = (n, self.layout.size)
-        self._starts = Starts(n, trajectory is None, is_uncertain(plant), self._workers)
+        self._starts = Starts(n, nearest, is_uncertain(plant), self._workers)
         self.state = self._state(n, bounds)
         self._prepare()
 
@@ -209,6 +209,20 @@ class Episodes:
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Draw the episodes of ``row`` from ``rng`` from now on."""
         self._starts.seed(row, rng)
+
+    def set_nearest(self, nearest_m: float) -> None:
+        """Let the robots of random trajectories drawn from now on come so near to each other (m) and no nearer.
+
+        Raises
+        ------
+        ValueError
+            If the scenario is no random family, or this is nearer than it is, or beyond the range of such families.
+        """
+        own = family_separation(self.settings.scenario)
+        require(own is not None, "scenario", "a random family", self.settings.scenario)
+        most = 1e-3 * FAMILY_MOST_MM
+        require(own <= nearest_m <= most, "nearest_m", f"from {own:g}, as of the scenario, to {most:g}", nearest_m)  # type: ignore[operator]
+        self._starts.nearest = nearest_m
 
     def draw(self, mask: Bools) -> None:
         """Draw the next episode of each row where ``mask`` says, from the row's generator."""

@@ -15,25 +15,24 @@ Floats = NDArray[np.float64]
 
 _AXES = 6  # x, y, heading of both robots
 RANDOM_SEPARATION_M = (0.020, 0.100)
-"""Range of the least separation in the random family."""
-_RANDOM_RADIUS_M = 0.082
-RANDOM_EXTENT = _RANDOM_RADIUS_M, RANDOM_SEPARATION_M[0]
-"""Greatest distance of a knot from the workspace's centre, least of the robots from each other, m."""
+"""Range of the least separation in the random family; in others of its kind it begins elsewhere."""
+RANDOM_RADIUS_M = 0.082
+"""Greatest distance of a knot from the workspace's centre."""
 _RANDOM_SPEED_MIN_MPS = 2e-4
 RANDOM_TURN_MAX_RADPS = 0.1
 
 
 @kernel
-def try_knots(stream: Keys, duration: float, turn_max: float, lanes: Floats, knots: Floats) -> bool:
+def try_knots(stream: Keys, duration: float, turn_max: float, nearest: float, lanes: Floats, knots: Floats) -> bool:
     """Draw a candidate and write its knots (33, 2, 3); return whether it is allowed, with knots written only then.
 
     The robots' midpoint travels through the workspace in a random direction on a bent path, while the line between
-    them turns slowly and its length falls to a random least separation and grows again; either robot may be on the
-    left. Headings are along the paths. Draws that leave the workspace, nearly stop or turn fast are not allowed.
-    ``lanes`` (8, 33), scratch, has all knots side by side, in one array and filled without branches, so that loops over
-    them are vectorised.
+    them turns slowly and its length falls to a random least separation, ``nearest`` (m) or more, and grows again;
+    either robot may be on the left. Headings are along the paths. Draws that leave the workspace, nearly stop or turn
+    fast are not allowed. ``lanes`` (8, 33), scratch, has all knots side by side, in one array and filled without
+    branches, so that loops over them are vectorised.
     """
-    a, b = uniform(stream, *RANDOM_SEPARATION_M), uniform(stream, *RANDOM_SEPARATION_M)
+    a, b = uniform(stream, nearest, RANDOM_SEPARATION_M[1]), uniform(stream, nearest, RANDOM_SEPARATION_M[1])
     closest, wider = min(a, b), abs(a - b)
     moment = uniform(stream, -0.6, 0.6)
     bend0, bend1, bend2 = normal(stream, 0.010), normal(stream, 0.010), normal(stream, 0.006)
@@ -58,7 +57,7 @@ def try_knots(stream: Keys, duration: float, turn_max: float, lanes: Floats, kno
             side, at = 2.0 * robot - 1.0, 3 * robot
             px, py = x + side * half_x, y + side * half_y
             vx, vy = x_rate + side * half_x_rate, y_rate + side * half_y_rate
-            forbidden += px * px + py * py > _RANDOM_RADIUS_M * _RANDOM_RADIUS_M
+            forbidden += px * px + py * py > RANDOM_RADIUS_M * RANDOM_RADIUS_M
             forbidden += vx * vx + vy * vy < speed_min * speed_min
             lanes[at, k], lanes[at + 1, k] = turn_c * px - turn_s * py, turn_s * px + turn_c * py
             lanes[at + 2, k], lanes[_AXES + robot, k] = turn_c * vx - turn_s * vy, turn_s * vx + turn_c * vy

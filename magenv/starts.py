@@ -112,17 +112,23 @@ class Starts:
     """The beginnings of ``n`` rows' episodes, one after another along each row's generator.
 
     They are drawn many at a time, since a call of a generator costs as much as its numbers.
+
+    Attributes
+    ----------
+    nearest : float, optional
+        Least separation of the random family (m) that trajectories are drawn from; None where all follow a shape. It
+        may be changed: episodes that begin later are drawn accordingly.
     """
 
-    def __init__(self, n: int, random: bool, uncertain: bool, workers: Workers) -> None:
-        self._random = random
+    def __init__(self, n: int, nearest: float | None, uncertain: bool, workers: Workers) -> None:
+        self.nearest = nearest
         self._uncertain = uncertain
         self._workers = workers
         self._rngs: list[np.random.Generator | None] = [None] * n
         self.used: NDArray[np.int64] = np.full(n, _AHEAD)
         self.offsets: Floats = np.zeros((n, _AHEAD, 6))
         self._sure = 0  # so many starts are drawn in every row
-        self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if random else 0), np.uint64)
+        self._keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if nearest is not None else 0), np.uint64)
         self.plant_keys: NDArray[np.uint64] = np.zeros((n, _AHEAD if uncertain else 0), np.uint64)
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
@@ -135,7 +141,7 @@ class Starts:
         rng = self._rngs[row]
         if rng is None:
             rng = self._rngs[row] = seeding.np_random(None)[0]
-        if self._random:
+        if self.nearest is not None:
             self._keys[row] = draw_keys(rng, _AHEAD)
         rng.standard_normal(out=self.offsets[row])
         if self._uncertain:  # after all else, so that a plant's kind changes neither trajectory nor start
@@ -152,7 +158,6 @@ class Starts:
                 self._draw_ahead(row)
             self._sure = _AHEAD - int(self.used.max())
         self._sure = max(self._sure - 1, 0)
-        if self._random:
-            self._workers.run(
-                draw_rows, len(mask), mask, self._keys, self.used, *random_limits(), coefficients, duration
-            )
+        if self.nearest is not None:
+            limits = (*random_limits(), self.nearest)
+            self._workers.run(draw_rows, len(mask), mask, self._keys, self.used, *limits, coefficients, duration)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magenv.arithmetic import fma
 from magenv.kernels import kernel, law
 from magenv.params import require
-from magenv.random_knots import RANDOM_TURN_MAX_RADPS, try_knots
+from magenv.random_knots import RANDOM_SEPARATION_M, RANDOM_TURN_MAX_RADPS, try_knots
 from magenv.shape_knots import SHAPES, shape_knots
 from magenv.streams import Keys
 
@@ -28,9 +28,13 @@ _KNOTS = SEGMENTS + 1
 _AXES = 6  # x, y, heading of both robots
 DURATION_S = 100.0
 
+LEAST_MM, MOST_MM, FAMILY_MOST_MM = 12, 100, 80
+"""Range of the separations of shapes, and greatest of the random family's least ones."""
 SCENARIO_HELP = (
-    f"random, {', '.join(f'{shape}-<s>' for shape in SHAPES)} or approach-<s>-anti with s from 12 to 100 (mm)"
+    f"random, {', '.join(f'{shape}-<s>' for shape in SHAPES)} or approach-<s>-anti with s from {LEAST_MM} to {MOST_MM} "
+    f"(mm), or random-<s> with s up to {FAMILY_MOST_MM}"
 )
+_FAMILY = re.compile(r"random-(\d+(?:\.\d+)?)", re.ASCII)
 _NAMED = re.compile(rf"({'|'.join(SHAPES)})-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)
 
 
@@ -163,22 +167,37 @@ def shaped(shape: str, separation_m: float, anti: bool = False) -> Trajectory:
         If there is no such shape, or the separation is not from 12 to 100 mm.
     """
     require(shape in SHAPES, "shape", f"one of {', '.join(SHAPES)}", shape)
-    require(0.012 <= separation_m <= 0.100, "separation_m", "from 0.012 to 0.100", separation_m)
+    low, high = 1e-3 * LEAST_MM, 1e-3 * MOST_MM
+    require(low <= separation_m <= high, "separation_m", f"from {low:.3f} to {high:.3f}", separation_m)
     return Trajectory.through(DURATION_S, shape_knots(shape, separation_m, anti, SEGMENTS))
 
 
+def family_separation(scenario: str) -> float | None:
+    """Return the least separation (m) of the random family that a scenario names; None where it names none.
+
+    ``random`` goes down to 20 mm, ``random-<s>`` to s mm.
+    """
+    if scenario == "random":
+        return RANDOM_SEPARATION_M[0]
+    match = _FAMILY.fullmatch(scenario) if isinstance(scenario, str) else None
+    if match is None or not LEAST_MM <= float(match[1]) <= FAMILY_MOST_MM:
+        return None
+    return float(match[1]) / 1000
+
+
 def named_trajectory(scenario: str) -> Trajectory | None:
-    """Return the trajectory of a named scenario; None for ``random``, of which every episode has its own.
+    """Return the trajectory of a named scenario; None for a random family, of which every episode has its own.
 
     Raises
     ------
     ValueError
         If the name is unknown.
     """
-    if scenario == "random":
+    if family_separation(scenario) is not None:
         return None
     match = _NAMED.fullmatch(scenario) if isinstance(scenario, str) else None
-    known = match is not None and 12 <= float(match[2]) <= 100 and (match[1] == SHAPES[0] or match[3] is None)
+    in_range = match is not None and LEAST_MM <= float(match[2]) <= MOST_MM
+    known = match is not None and in_range and (match[1] == SHAPES[0] or match[3] is None)
     require(known, "scenario", SCENARIO_HELP, scenario)
     assert match is not None
     return shaped(match[1], float(match[2]) / 1000, anti=match[3] is not None)
@@ -193,19 +212,21 @@ def draw_rows(
     used: NDArray[np.int64],
     duration_s: float,
     turn_max: float,
+    nearest: float,
     coefficients: Floats,
     duration: Floats,
 ) -> None:
     """Draw trajectories (n, 32, 2, 3, 4) and (n,) where ``mask`` says, of rows first to last.
 
-    Each from the first of its row's keys (n, k) after the ``used`` ones (n,).
+    Each from the first of its row's keys (n, k) after the ``used`` ones (n,). ``nearest`` (m) is the least of their
+    separations.
     """
     knots, slopes, stream = np.empty((_KNOTS, 2, 3)), np.empty((_KNOTS, 2, 3)), np.empty(1, np.uint64)
     lanes = np.empty((_AXES + 2, _KNOTS))
     for i in range(first, last):
         if mask[i]:
             stream[0] = keys[i, used[i]]
-            while not try_knots(stream, duration_s, turn_max, lanes, knots):
+            while not try_knots(stream, duration_s, turn_max, nearest, lanes, knots):
                 pass
             spline_through(knots, slopes, coefficients[i])
             duration[i] = duration_s
@@ -222,7 +243,7 @@ def draw_keys(rng: np.random.Generator, n: int) -> Keys:
 
 
 def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
-    """Return the trajectory that an episode of a scenario follows, drawing from ``rng`` for ``random`` alone.
+    """Return the trajectory that an episode of a scenario follows, drawing from ``rng`` for a random family alone.
 
     Raises
     ------
@@ -234,5 +255,7 @@ def draw(scenario: str, rng: np.random.Generator) -> Trajectory:
         return named
     coefficients, duration = np.empty((1, SEGMENTS, 2, 3, 4)), np.empty(1)
     keys, used = draw_keys(rng, 1)[None], np.zeros(1, np.int64)
-    draw_rows(0, 1, np.ones(1, np.bool_), keys, used, *random_limits(), coefficients, duration)
+    nearest = family_separation(scenario)
+    assert nearest is not None
+    draw_rows(0, 1, np.ones(1, np.bool_), keys, used, *random_limits(), nearest, coefficients, duration)
     return Trajectory(float(duration[0]), coefficients[0])

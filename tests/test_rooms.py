@@ -172,6 +172,8 @@ def test_torch_is_for_training_alone() -> None:
         "networks",
         "sb3_vec",
         "residual_vec",
+        "history_vec",
+        "curriculum",
         "cloning",
         "checkpoints",
         "keeper",

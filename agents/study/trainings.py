@@ -118,6 +118,18 @@ TRAININGS = (
         group="ablation: trajectories",
     ),
     Training(
+        "short-curriculum",
+        "`short` that begins with robots 60 mm apart and more",
+        TrainConfig(curriculum=60.0, steps=SHORT),
+        group="ablation: trajectories",
+    ),
+    Training(
+        "home-curriculum",
+        "`ppo-home` that begins with robots 60 mm apart and more",
+        TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=3_000_000),
+        group="ablation: trajectories",
+    ),
+    Training(
         "residual-three",
         "PPO that corrects `steered`",
         TrainConfig(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
