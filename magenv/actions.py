@@ -216,8 +216,9 @@ class Actions:
         self._system = system
         self._workers = workers or Workers()
         self._limits = np.array([system.r_min_m, system.r_max_m, system.gap_min_m, *shell])
-        self._home = home_pose(system.n_epm)
-        self.home_epms = home_epms(system.n_epm)
+        turn = (plant or Plant()).home_turn_rad
+        self._home = home_pose(system.n_epm, turn)
+        self.home_epms = home_epms(system.n_epm, turn)
         self._low, self._high = pose_bounds(system)
         # Starts of the allocation in ``wrench``: the present pose, the home pose, a few fixed ones.
         fallback = np.random.default_rng(0).uniform(self._low, self._high, (_FALLBACK_STARTS, len(self._low)))

@@ -28,10 +28,10 @@ HOME_RADIUS_OUT_M = 0.15
 """Largest offset of a radius outwards in ``home``; inwards it reaches r_min."""
 
 
-def home_epms(n_epm: int) -> Floats:
-    """Return the EPMs (N, 6) at home in the robots' frame, as ``home_rows`` would place them."""
+def home_epms(n_epm: int, turn: float = 0.0) -> Floats:
+    """Return the EPMs (N, 6) at home in the robots' frame, as ``home_rows`` would place them (see ``home_pose``)."""
     lanes = np.zeros((LANES_SIZE, LANES))
-    lanes[:POSE_SIZE, :n_epm] = home_pose(n_epm).reshape(-1, POSE_SIZE).T
+    lanes[:POSE_SIZE, :n_epm] = home_pose(n_epm, turn).reshape(-1, POSE_SIZE).T
     place_lanes(lanes)
     return lanes[POSE_SIZE:, :n_epm].T.copy()
 

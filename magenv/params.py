@@ -194,6 +194,9 @@ class Plant:
     """Of the shoulders from the workspace centre, level; the arms stand evenly round it (ours, as the next)."""
     arm_height_m: float = 0.45
     """Of the shoulders above the robots' plane, m: 0.36 m above what the arms stand on (data sheet)."""
+    home_turn_rad: float = 0.0
+    """By how much the ring on which the EPMs stand at home is turned about the robots' heading: two of them stand on a
+    level at -0.593, one above the other at 0.977."""
     epm_cylinders: bool = False
     """Whether EPMs act on the robots as the cylinders that they are (``System.epm``) and not as dipoles. The robots'
     magnets stay dipoles: 20 mm apart the force between them is 1.2 % off at most, that of an EPM at 0.15 m 12 %."""
@@ -226,6 +229,8 @@ class Plant:
         )
         _require_positive(arm_distance_m=self.arm_distance_m)
         require(_is_number(self.arm_height_m), "arm_height_m", "a finite number", self.arm_height_m)
+        turn = self.home_turn_rad
+        require(_is_number(turn) and abs(turn) <= math.pi, "home_turn_rad", "a number from -pi to pi", turn)
         require(isinstance(self.epm_cylinders, bool), "epm_cylinders", "True or False", self.epm_cylinders)
         require(
             self.workspace_radius_m > self.body.diameter_m,

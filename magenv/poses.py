@@ -201,16 +201,17 @@ def robots_frame(heading_1: float, heading_2: float) -> float:
     return arctan2(s, c)
 
 
-def home_pose(n_epm: int) -> Floats:
+def home_pose(n_epm: int, turn: float = 0.0) -> Floats:
     """Return the home pose vector (5 N) in the robots' frame, whose x axis is the heading.
 
     The EPMs stand on a ring round the heading through the workspace centre, broadside to it, their moments against
-    the heading: there the fields of all add up along the robots' moments.
+    the heading: there the fields of all add up along the robots' moments. The ring may be turned about the heading
+    (rad).
     """
     require(n_epm in HOME_TILT_RAD, "n_epm", "2 or 3", n_epm)
     poses = np.empty((n_epm, POSE_SIZE))
     for k, pose in enumerate(poses):
-        angle = HOME_TILT_RAD[n_epm] + 2 * math.pi * k / n_epm
+        angle = HOME_TILT_RAD[n_epm] + turn + 2 * math.pi * k / n_epm
         place = (0.0, HOME_RADIUS_M * math.cos(angle), HOME_RADIUS_M * math.sin(angle))
         epm_to_pose(np.array([*place, -1.0, 0.0, 0.0]), pose)
     return poses.reshape(-1)

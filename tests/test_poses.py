@@ -8,13 +8,15 @@ import math
 import magpylib
 import numpy as np
 import pytest
+from messages import refusal
 from numpy.typing import NDArray
 
 from magenv.actions import Actions
 from magenv.dipole import field
-from magenv.params import System
+from magenv.params import System, plant_named
 from magenv.poses import (
     HOME_RADIUS_M,
+    HOME_TILT_RAD,
     from_cartesian,
     home_pose,
     pose_bounds,
@@ -182,9 +184,10 @@ def test_home_for_two_epms_is_broadside_and_opposite() -> None:
     assert pytest.approx(0.2) == HOME_RADIUS_M
 
 
+@pytest.mark.parametrize("turn", [0.0, -HOME_TILT_RAD[2], 0.5 * math.pi - HOME_TILT_RAD[2]])
 @pytest.mark.parametrize("n_epm", [2, 3])
-def test_home_field_points_along_the_heading(n_epm: int) -> None:
-    centres, directions = to_cartesian(home_pose(n_epm))
+def test_home_field_points_along_the_heading(n_epm: int, turn: float) -> None:
+    centres, directions = to_cartesian(home_pose(n_epm, turn))
     moment = System(n_epm=n_epm).epm_moment_am2
     b = field(moment * directions, centres, [0.0, 0.0, 0.0])
     np.testing.assert_allclose(b[:, 1:], 0.0, atol=1e-12)
@@ -196,6 +199,19 @@ def home_centres(actions: Actions, heading_1: Floats, heading_2: Floats) -> Floa
     measured = np.zeros((len(heading_1), 2, 3))
     measured[:, 0, 2], measured[:, 1, 2] = heading_1, heading_2
     return actions.home(measured)
+
+
+def test_a_plant_may_turn_home_about_the_heading() -> None:
+    """On a level, and one above the other: the first to the left of the robots, and above them."""
+    for turn, place in ((-0.593, [0.0, 0.2, 0.0]), (0.977, [0.0, 0.0, 0.2])):
+        actions = Actions("home", System(), plant=plant_named(f"paper:home_turn_rad={turn}"))
+        epms = actions.home(np.zeros((1, 2, 3)))[0]
+        np.testing.assert_allclose(epms[:, :3], [place, [-x for x in place]], atol=2e-4)
+        np.testing.assert_array_equal(epms, actions.to_epms(np.zeros((1, 10)), np.zeros((1, 2, 3)), epms[None])[0][0])
+    for turn in ("4", "nan"):
+        assert "home_turn_rad must be a number from -pi to pi" in refusal(
+            lambda turn=turn: plant_named(f"paper:home_turn_rad={turn}")  # type: ignore[misc]
+        )
 
 
 @pytest.mark.parametrize("n_epm", [2, 3])

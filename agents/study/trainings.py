@@ -43,8 +43,8 @@ HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6)
 CLONE_PPO = PPOConfig(learning_rate=2e-4, log_std_init=-3.5)
 """A clone is near what it looks for."""
 
-SHORT = 200_000
-"""Steps of trainings that are compared with each other alone."""
+SHORT, HOME_SHORT = 200_000, 1_000_000
+"""Steps of trainings that are compared with each other alone, in velocities and in offsets from home."""
 
 TRAININGS = (
     Training(
@@ -128,6 +128,24 @@ TRAININGS = (
         "`ppo-home` that begins with robots 60 mm apart and more",
         TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=3_000_000),
         group="ablation: trajectories",
+    ),
+    Training(
+        "home-short",
+        "`ppo-home` in fewer steps",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
+        group="ablation: home",
+    ),
+    Training(
+        "home-level",
+        "EPMs that stand on a level with the robots at home",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=-0.593"),
+        group="ablation: home",
+    ),
+    Training(
+        "home-upright",
+        "EPMs that stand above and below the robots at home",
+        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=0.977"),
+        group="ablation: home",
     ),
     Training(
         "residual-three",
