@@ -69,7 +69,7 @@ class TwoRobots(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ## Arguments
     | name | default | |
     |---|---|---|
-    | ``scenario`` | ``random`` | ``random`` (training family), ``random-<s>``, or a shape: ``approach-<s>``, ...; mm |
+    | ``scenario`` | ``random`` | ``random`` (training family), ``random-<s>``, a shape as ``approach-<s>``; s in mm |
     | ``plant`` | ``paper`` | EPMs jump to their commanded poses, no noise; ``moving``: they go there at 1 m/s and |
     | | | 180 degrees/s at most, give way to each other, and act on the robots on the way; ``arm``: these moves begin |
     | | | and end at rest (5 m/s^2, 10 rad/s^2), commands act 0.1 s late, noise is 1.3 mm and 1.1 degrees, |

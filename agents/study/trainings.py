@@ -125,8 +125,8 @@ TRAININGS = (
     ),
     Training(
         "home-curriculum",
-        "`ppo-home` that begins with robots 60 mm apart and more",
-        TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=3_000_000),
+        "`home-short` that begins with robots 60 mm apart and more",
+        TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
         group="ablation: trajectories",
     ),
     Training(
