@@ -44,6 +44,7 @@ def test_a_command_tells_what_is_not_the_default_alone() -> None:
 def test_trainings_have_names_of_their_own() -> None:
     assert len(set(names())) == len(names())
     assert not set(names()) & set(catalogue.names()), "records of agents and controllers lie in folders side by side"
+    assert all(set(one.compared_with) <= set(names()) - {one.name} for one in TRAININGS)
     assert all(len(set(one.seeds)) == len(one.seeds) > 0 for one in TRAININGS)
 
 

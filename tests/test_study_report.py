@@ -25,7 +25,7 @@ from agents.study import entries, report
 from agents.study.entries import Entry
 from agents.study.evidence import collect
 from agents.study.figures import curves, profiles
-from agents.study.trainings import SCENARIOS, training
+from agents.study.trainings import MAIN, SCENARIOS, training
 
 SEEDS = {"ppo-home": 3, "sac-home": 2, "ppo-pose": 2, "short-errors": 1}
 CONTROLLERS = ("baseline", "tuned", "ppo")
@@ -74,7 +74,8 @@ def test_every_agent_and_controller_is_told_of(page: Path) -> None:
     (over_all,) = tables(page, "Over all scenarios")
     assert list(over_all) == ["", *names, *SEEDS]
     (against,) = tables(page, "Agents against controllers")
-    assert list(against) == ["", *(f"{agent} over {name}" for agent in SEEDS for name in names)]
+    main = [agent for agent in SEEDS if training(agent).group == MAIN]
+    assert list(against) == ["", *(f"{agent} over {name}" for agent in main for name in names)]
 
 
 @pytest.mark.parametrize("name", ["baseline", "ppo-home", "sac-home"])
@@ -126,6 +127,15 @@ def test_ablations_stand_beside_the_main_agents_of_their_algorithm(page: Path) -
         assert list(table) == ["", "ppo-home", "ppo-pose"]
     for table in tables(page, "Ablation: observation"):
         assert list(table) == ["", "ppo-home", "short-errors"]
+
+
+def test_ablations_stand_beside_what_they_are_compared_with(tmp_path: Path) -> None:
+    a_store(tmp_path / "store", {"ppo-home": 1, "ppo-velocity": 1, "short": 1, "short-one": 1}, ("tuned",))
+    page = report.write_results(tmp_path / "store", tmp_path / "page")
+    for table in tables(page, "Ablation: observation"):
+        assert list(table) == ["", "ppo-velocity", "short"]
+    for table in tables(page, "Ablation: trajectories"):
+        assert list(table) == ["", "short", "short-one"]
 
 
 def test_a_store_of_lost_episodes_alone_is_told(tmp_path: Path) -> None:
@@ -285,7 +295,7 @@ def test_records_that_do_not_belong_are_refused_and_nothing_is_written(tmp_path:
     made = unlike().training
     assert made is not None
     cases = {
-        "known name": unlike(name="ppo-old"),
+        "of a training of the study": unlike(name="ppo-old"),
         "action 'home'": unlike(training=dataclasses.replace(made, config=made.config | {"action": "step"})),
         "12 episodes of approach-60": an_entry("ppo-home", 1, episodes=3),
         "same scenarios": unlike(outcomes={"approach-60": unlike().outcomes["approach-60"]}),

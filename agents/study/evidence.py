@@ -123,7 +123,7 @@ def collect(store: Path) -> list[Measured]:
     known = [*catalogue.names(), *trainings.names()]
     for entry in entries:
         path = store / entry.file
-        require(entry.name in known, str(path), f"of a known name ({', '.join(known)})", entry.name)
+        require(entry.name in known, str(path), "of a training of the study or a controller of evaluate.py", entry.name)
         agent = entry.name in trainings.names()
         require(agent == (entry.training is not None), str(path), "an agent's if it is of a training", entry.name)
         if entry.training is not None:
@@ -165,10 +165,10 @@ def groups(measured: Sequence[Measured]) -> list[str]:
 
 
 def beside(measured: Sequence[Measured], group: str) -> list[Measured]:
-    """Return the agents of a group, behind what they are compared with in the same environments.
+    """Return the agents of a group, behind what they are compared with.
 
-    That is the agents of the main group that have the same algorithm, and, where the environment is not the usual one,
-    the controllers.
+    That is what their trainings name, or the agents of the main group that have the same algorithm in the same
+    environments; and, where the environment is not the usual one, the controllers there.
     """
     own = [one for one in measured if one.training is not None and one.group == group]
     if group == MAIN:
@@ -176,5 +176,10 @@ def beside(measured: Sequence[Measured], group: str) -> list[Measured]:
     algos = {one.training.config.algo for one in own if one.training is not None}
     places = {one.where for one in own}
     controllers = [one for one in measured if one.training is None and one.where in places - {USUAL}]
-    main = [one for one in beside(measured, MAIN) if one.training is not None and one.training.config.algo in algos]
-    return [*controllers, *(one for one in main if one.where in places), *own]
+    named = {name for one in own if one.training is not None for name in one.training.compared_with}
+    if named:
+        others = [one for one in measured if one.name in named and one.group != group]
+    else:
+        main = [one for one in beside(measured, MAIN) if one.training is not None and one.training.config.algo in algos]
+        others = [one for one in main if one.where in places]
+    return [*controllers, *others, *own]

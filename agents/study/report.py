@@ -38,7 +38,7 @@ right is the success."""
 _IMPROVEMENT = """\
 The chance that an agent errs less in position than a controller on the same episode, mean over episodes and seeds; \
 lost episodes are the worst, and if both are lost it counts half. In brackets the 95 % bootstrap interval over whole \
-seeds. 0.5 means that neither is better."""
+seeds. 0.5 means that neither is better. Ablations are left out."""
 _CURVES = """\
 Success and errors in training, means over its last 200 episodes, which are drawn from the scenario trained on, \
 explored with noise and counted until their end or loss: they are not the errors of the tables. Lines are medians over \

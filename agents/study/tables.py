@@ -21,7 +21,7 @@ from agents.study.evidence import (
     mean_until_end,
     success_rate,
 )
-from agents.study.trainings import SCENARIOS, as_told
+from agents.study.trainings import MAIN, SCENARIOS, as_told
 from magenv.origin import UNKNOWN
 
 Floats = NDArray[np.float64]
@@ -105,10 +105,14 @@ def _aggregate(scores: Floats) -> list[str]:
 
 
 def improvements(measured: Sequence[Measured], scenarios: Sequence[str]) -> list[str]:
-    """Return the table of the chances that an agent errs less than a controller of the same setting."""
+    """Return the table of the chances that an agent errs less than a controller of the same setting.
+
+    Of the agents of the main group, and of those of settings that it does not come to.
+    """
     rows = []
     controllers = [one for one in measured if one.training is None]
-    for agent in (one for one in measured if one.training is not None):
+    agents = [one for one in measured if one.training is not None]
+    for agent in (one for one in agents if one.group == MAIN or one.where != USUAL):
         for controller in (one for one in controllers if one.where == agent.where):
             both = [agent.measured_on([s]) and controller.measured_on([s]) for s in scenarios]
             cells = [

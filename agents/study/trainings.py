@@ -15,7 +15,7 @@ from magenv.params import require
 SCENARIOS = ("approach-60", "approach-30", "approach-22.5", "crossing-30", "meeting-30", "eight-30", "still-30")
 """On which every agent and controller is measured."""
 MAIN = "main"
-"""Group of the agents that stand beside the controllers; all others are compared with those of it."""
+"""Group of the agents that stand beside the controllers."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class Training:
     seeds: tuple[int, ...] = (0, 1, 2)
     group: str = MAIN
     """``main``, or of which comparison it is a part."""
+    compared_with: tuple[str, ...] = ()
+    """Trainings that stand beside it there; without any, those of the main group."""
     scenarios: tuple[str, ...] = SCENARIOS
     """Measured on."""
 
@@ -95,7 +97,13 @@ TRAININGS = (
         TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=300_000),
         group="ablation: action",
     ),
-    Training("short", "`ppo-velocity` in fewer steps", TrainConfig(steps=SHORT), group="ablation: observation"),
+    Training(
+        "short",
+        "`ppo-velocity` in fewer steps",
+        TrainConfig(steps=SHORT),
+        group="ablation: observation",
+        compared_with=("ppo-velocity",),
+    ),
     Training(
         "short-global", "the global frame", TrainConfig(frame="global", steps=SHORT), group="ablation: observation"
     ),
@@ -116,24 +124,28 @@ TRAININGS = (
         "one scenario alone, `approach-30`, instead of the random family",
         TrainConfig(scenario="approach-30", steps=SHORT),
         group="ablation: trajectories",
+        compared_with=("short",),
     ),
     Training(
         "short-curriculum",
         "`short` that begins with robots 60 mm apart and more",
         TrainConfig(curriculum=60.0, steps=SHORT),
         group="ablation: trajectories",
+        compared_with=("short",),
     ),
     Training(
         "home-curriculum",
         "`home-short` that begins with robots 60 mm apart and more",
         TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
         group="ablation: trajectories",
+        compared_with=("home-short",),
     ),
     Training(
         "home-short",
         "`ppo-home` in fewer steps",
         TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
         group="ablation: home",
+        compared_with=("ppo-home",),
     ),
     Training(
         "home-level",
