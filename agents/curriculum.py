@@ -20,11 +20,11 @@ def nearest_m(config: TrainConfig, steps: int) -> float:
     """
     first, last = config.curriculum_m
     left = max(1.0 - steps / (FALLS_FOR * config.total_steps), 0.0)
-    return last + left * (first - last)
+    return min(last + left * (first - last), first)  # rounding
 
 
 class Curriculum(BaseCallback):
-    """Lets the least separation fall before each rollout.
+    """Lets the least separation fall with every step, of cloning as well.
 
     Parameters
     ----------
@@ -43,8 +43,6 @@ class Curriculum(BaseCallback):
         self._config, self._robots = config, robots
         robots.set_nearest(nearest_m(config, steps))
 
-    def _on_rollout_start(self) -> None:
-        self._robots.set_nearest(nearest_m(self._config, self.num_timesteps))
-
     def _on_step(self) -> bool:
+        self._robots.set_nearest(nearest_m(self._config, self.model.num_timesteps))
         return True

@@ -106,7 +106,9 @@ class Episodes:
         self._workers = Workers(threads, LANES if settings.action in PLANAR else None)  # searches differ in length
         shell = Shell.of(self.system, plant)
         self.actions = Actions(settings.action, self.system, self._workers, shell, plant, self.task.period_s)
-        reach_and_gap = (RANDOM_RADIUS_M, nearest or 0.0) if trajectory is None else extent(trajectory)
+        reach_and_gap = (RANDOM_RADIUS_M, 0.0 if nearest is None else nearest)
+        if trajectory is not None:
+            reach_and_gap = extent(trajectory)
         check_extent(reach_and_gap, plant, "scenario", f"{settings.scenario!r} on {settings.plant!r}")
         self.world = World(n, self.system, plant, self.task, trajectory, self._workers)
         bounds = self.layout.bounds()
@@ -218,10 +220,11 @@ class Episodes:
         ValueError
             If the scenario is no random family, or this is nearer than it is, or beyond the range of such families.
         """
-        own = family_separation(self.settings.scenario)
+        own, most = family_separation(self.settings.scenario), 1e-3 * FAMILY_MOST_MM
         require(own is not None, "scenario", "a random family", self.settings.scenario)
-        most = 1e-3 * FAMILY_MOST_MM
-        require(own <= nearest_m <= most, "nearest_m", f"from {own:g}, as of the scenario, to {most:g}", nearest_m)  # type: ignore[operator]
+        assert own is not None
+        fits = isinstance(nearest_m, int | float) and own <= nearest_m <= most
+        require(fits, "nearest_m", f"from {own:g}, as of the scenario, to {most:g}", nearest_m)
         self._starts.nearest = nearest_m
 
     def draw(self, mask: Bools) -> None:

@@ -29,10 +29,10 @@ _AXES = 6  # x, y, heading of both robots
 DURATION_S = 100.0
 
 LEAST_MM, MOST_MM, FAMILY_MOST_MM = 12, 100, 80
-"""Range of the separations of shapes, and greatest of the random family's least ones."""
+"""Range of the separations of shapes, and greatest of a random family's least ones, which begin at the same."""
 SCENARIO_HELP = (
     f"random, {', '.join(f'{shape}-<s>' for shape in SHAPES)} or approach-<s>-anti with s from {LEAST_MM} to {MOST_MM} "
-    f"(mm), or random-<s> with s up to {FAMILY_MOST_MM}"
+    f"(mm), or random-<s> with s from {LEAST_MM} to {FAMILY_MOST_MM}"
 )
 _FAMILY = re.compile(r"random-(\d+(?:\.\d+)?)", re.ASCII)
 _NAMED = re.compile(rf"({'|'.join(SHAPES)})-(\d+(?:\.\d+)?)(-anti)?", re.ASCII)

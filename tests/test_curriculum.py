@@ -13,7 +13,7 @@ from messages import refusal
 from tiny_runs import CONFIGS, both, going_on, tensors_of
 
 from agents.checkpoints import stored_config
-from agents.configs import TrainConfig, command_of
+from agents.configs import CloningConfig, TrainConfig, command_of
 from agents.curriculum import nearest_m
 from agents.learning import train
 from agents.sb3_vec import TwoRobotsVecEnv
@@ -60,8 +60,8 @@ def test_episodes_that_begin_from_now_on_keep_the_separation() -> None:
     assert 0.0199 < gap(env) < 0.03
 
 
-def test_a_family_draws_the_same_way_whatever_its_separation() -> None:
-    """The same numbers make the same way, stretched: ``random`` is the family that comes to 20 mm."""
+def test_a_family_comes_to_its_separation() -> None:
+    """``random`` is the one that comes to 20 mm."""
     for seed in range(20):
         one, other = (draw(name, np.random.default_rng(seed)) for name in ("random", "random-20"))
         np.testing.assert_array_equal(one.coefficients, other.coefficients)
@@ -74,17 +74,24 @@ def test_a_family_draws_the_same_way_whatever_its_separation() -> None:
 
 
 def test_the_separation_falls_until_half_of_the_training_is_done(nearest: list[float], tmp_path: Path) -> None:
+    """Evenly, with every step of the eight environments; before the first one, it is what the curriculum tells."""
     train(easy_first(out=tmp_path / "run"))
-    assert nearest == pytest.approx([60.0, 60.0, 40.0, 20.0, 20.0])
+    assert nearest == pytest.approx([max(60.0 - 40.0 * steps / 256, 20.0) for steps in range(0, 513, 8)])
 
 
-def test_it_goes_on_from_where_it_was(nearest: list[float], tmp_path: Path) -> None:
+def test_steps_of_cloning_count(nearest: list[float], tmp_path: Path) -> None:
+    cloning = CloningConfig(rounds=4, steps=16, epochs=1)
+    config = easy_first(expert="idle", cloning=cloning, steps=1024, checkpoint_every=512, out=tmp_path / "run")
+    train(config)
+    assert nearest == pytest.approx([max(60.0 - 40.0 * steps / 512, 20.0) for steps in range(0, 1025, 8)])
+
+
+def test_a_run_gone_on_with_is_as_far_as_its_steps_are_of_all(nearest: list[float], tmp_path: Path) -> None:
     train(easy_first(steps=128, out=tmp_path / "run"))
     assert stored_config(tmp_path / "run").curriculum == 60.0
     nearest.clear()
     train(going_on(tmp_path / "run", steps=1024))
-    assert nearest[:3] == pytest.approx([50.0, 50.0, 40.0])
-    assert nearest[-1] == 20.0
+    assert nearest == pytest.approx([max(60.0 - 40.0 * steps / 512, 20.0) for steps in range(128, 1025, 8)])
     assert "curriculum" in refusal(lambda: train(going_on(tmp_path / "run", steps=2048, curriculum=None)))
 
 
@@ -106,6 +113,7 @@ def test_it_ends_with_the_scenarios_own_separation() -> None:
     assert path[0] == pytest.approx(0.0717)
     assert path == sorted(path, reverse=True)
     assert path[20:] == [family_separation("random-33.3")] * 21
+    assert nearest_m(TrainConfig(scenario="random-14.3", curriculum=80.0), 0) == 0.08, "no more by rounding"
     assert command_of(config) == "python train.py --scenario random-33.3 --curriculum 71.7 --steps 1000"
 
 
@@ -119,9 +127,14 @@ def test_it_ends_with_the_scenarios_own_separation() -> None:
         (lambda: TrainConfig(scenario="approach-30", curriculum=60.0), "scenario must be a random family"),
         (lambda: TwoRobotsVecEnv(1, Settings(), 0).set_nearest(0.019), "nearest_m must be from 0.02"),
         (lambda: TwoRobotsVecEnv(1, Settings(), 0).set_nearest(float("nan")), "nearest_m must be from 0.02"),
+        (lambda: TwoRobotsVecEnv(1, Settings(), 0).set_nearest("near"), "nearest_m must be from 0.02"),  # type: ignore[arg-type]
         (lambda: TwoRobotsVecEnv(1, Settings("still-30"), 0).set_nearest(0.05), "scenario must be a random family"),
         (lambda: TwoRobotsVecEnv(1, Settings("random-11"), 0), "scenario must be random, approach-<s>"),
-        (lambda: TwoRobotsVecEnv(1, Settings("random-80.1"), 0), "or random-<s> with s up to 80"),
+        (lambda: TwoRobotsVecEnv(1, Settings("random-80.1"), 0), "or random-<s> with s from 12 to 80"),
+        (
+            lambda: TwoRobotsVecEnv(1, Settings("random-30", "paper:workspace_radius_m=0.08"), 0),
+            "scenario must be such",
+        ),
         (lambda: TwoRobotsVecEnv(1, Settings("random-"), 0), "scenario must be random"),
         (lambda: TwoRobotsVecEnv(1, Settings("random-30-anti"), 0), "scenario must be random"),
     ],
