@@ -30,8 +30,8 @@ class EvaluateConfig:
     controllers: tuple[str, ...] | None = None
     """Names (see --list) or folders of trained models; by default baseline, tuned and the shipped agents that fit."""
     scenarios: tuple[str, ...] | None = None
-    """approach-<s>, approach-<s>-anti, crossing-<s>, meeting-<s>, eight-<s>, still-<s> with s in mm, or random; by
-    default approach-60, and but for --robustness approach-30."""
+    """approach-<s>, approach-<s>-anti, crossing-<s>, meeting-<s>, eight-<s>, still-<s> with s in mm, random or
+    random-<s>; by default approach-60, and but for --robustness approach-30."""
     plant: str = "paper"
     """Plant acted on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2

@@ -144,11 +144,11 @@ class TrainConfig:
     algo: Algo = "ppo"
     """Learning algorithm."""
     scenario: str = "random"
-    """Trajectories trained on: random (the seeded family), random-<s> (its like, whose robots come to s mm of each
-    other), or a shape as in evaluate.py."""
+    """Trajectories trained on: random (the seeded family, robots come to 20 to 100 mm of each other), random-<s> (its
+    like, from s mm on), or a shape as in evaluate.py."""
     curriculum: float | None = None
     """Separation (mm) that robots keep at first on a random family; it falls evenly to the family's own, where it comes
-    after half of all steps."""
+    after half of all steps, those of a run gone on with included."""
     plant: str = "paper"
     """Plant trained on; parameters may be changed, as in arm:latency_s=0.05,mismatch=0."""
     n_epm: int = 2
@@ -163,8 +163,8 @@ class TrainConfig:
     control_hz: float = 2.0
     """Control rate."""
     history: int = 1
-    """How many of its episode's last observations the agent sees, side by side; one where it is to correct or to clone
-    a controller."""
+    """How many of its episode's last observations the agent sees, side by side; one with --residual or --expert. SAC's
+    buffer keeps as many of each step."""
     residual: str | None = None
     """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
     residual_scale: float = 0.1

@@ -1,7 +1,7 @@
 """Policies that see the last observations of their episode side by side. The law of training and of use.
 
 One observation tells neither how the robots answer to their magnets, nor where they are beyond the noise of a single
-measurement; several do. What was commanded stands in them, as the EPMs' poses.
+measurement; several do. Where the EPMs were, full observations tell as well.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ def recalled(
     ``past`` (n, history, d) are those of the instant before. Where an episode begins, in the rows of ``starts`` (n,) or
     without a past, its first observation stands for all that came before.
     """
-    first = np.repeat(observation[:, None], history, axis=1)
     if past is None:
-        return first
+        return np.repeat(observation[:, None], history, axis=1)
     told: Observations = np.concatenate([past[:, 1:], observation[:, None]], axis=1)
     if starts is not None:
-        told[starts] = first[starts]
+        told[starts] = observation[starts, None]
     return told
 
 
 def side_by_side(past: Observations) -> Observations:
     """Return what the policy sees (n, history * d) of the last observations (n, history, d)."""
-    return past.reshape(len(past), -1)
+    n, history, size = past.shape
+    return past.reshape(n, history * size)
 
 
 class Recalling:
@@ -72,8 +72,14 @@ class Recalling:
     ) -> tuple[Actions, Any]:
         """Return actions (n, a) or (a,) for observations (n, d) or (d,), and the observations seen (n, history, d)."""
         batch = np.atleast_2d(observation)
-        if state is not None:
-            require(len(state) == len(batch), "state", f"one of {len(batch)} episodes, as observations", len(state))
-        past = recalled(state, batch, self._history, episode_start)
+        n, size = batch.shape
+        must_be = f"what was seen of {n} episodes, of shape {(n, self._history, size)}"
+        seen: Any = np.shape(state)  # type: ignore[arg-type]
+        require(state is None or seen == (n, self._history, size), "state", must_be, seen)
+        starts = None
+        if episode_start is not None:
+            starts = np.asarray(episode_start, np.bool_)
+            require(starts.shape == (n,), "episode_start", f"of shape ({n},)", starts.shape)
+        past = recalled(state, batch, self._history, starts)
         actions = self._policy(side_by_side(past))
-        return actions.reshape(*np.shape(observation)[:-1], -1), past
+        return actions.reshape(*np.shape(observation)[:-1], actions.shape[-1]), past

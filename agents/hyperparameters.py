@@ -119,7 +119,7 @@ def _search(optuna: Any, config: TrainConfig, folder: Path) -> Path:
 def _shortened(config: TrainConfig) -> TrainConfig:
     """Return the training of a trial; raises where so few steps are too few for it."""
     steps = max(1, config.total_steps // SHARE)
-    return dataclasses.replace(config, tune=False, trials=None, steps=steps, checkpoint_every=None)
+    return dataclasses.replace(config, steps=steps, checkpoint_every=None)
 
 
 def _try(optuna: Any, study: optuna.Study, config: TrainConfig, folder: Path) -> Trial:

@@ -142,7 +142,7 @@ class Predictive:
         least = 1 if self._plant.epms_jump or period > HORIZON_S else 2
         self._stages = min(4, max(least, round(HORIZON_S / period)))
         self._planner = Planner(self._system, self._plant, period, self._substeps, self._stages)
-        self._home = home_epms(n_epm)
+        self._home = home_epms(n_epm, self._plant.home_turn_rad)
         self._held = Course.of(n_epm, self._substeps, True)
         self._lag = round(self._plant.latency_s / (period / self._substeps))
         late = self._plant.latency_s

@@ -169,6 +169,8 @@ def load_card(folder: Path) -> Card:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
     check_net(card.net)
     check_history(card.history)
+    alone = card.residual is None
+    require(alone or card.history == 1, "model's history", "1 where it corrects a controller", card.history)
     for name, value, kind in (
         ("algo", card.algo, str),
         ("steps", card.steps, int),

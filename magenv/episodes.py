@@ -194,7 +194,7 @@ class Episodes:
         trajectory = named_trajectory(self.settings.scenario)
         if trajectory is None:
             return np.zeros((max(n, 2), self.settings.n_epm, EPM_SIZE))
-        return holding_epms(trajectory.at(0.0), self.system, self.world.motion.shell)[None]
+        return holding_epms(trajectory.at(0.0), self.system, self.world.motion.shell, plant.home_turn_rad)[None]
 
     def _prepare(self) -> None:
         self.packed = packed(self.state)
@@ -233,8 +233,8 @@ class Episodes:
         if len(self.state.held_epms) > 1:  # each row has a trajectory of its own
             for row in np.flatnonzero(mask).tolist():
                 start = self.world.trajectory(row).at(0.0)
-                shell = self.world.motion.shell
-                self.state.held_epms[row] = holding_epms(start, self.system, shell, at_best=True)
+                shell, turn = self.world.motion.shell, self.plant.home_turn_rad
+                self.state.held_epms[row] = holding_epms(start, self.system, shell, turn, at_best=True)
 
     def start(self, mask: Bools, observations: Observations | None = None) -> Observations:
         """Begin a new episode in each row where ``mask`` says, drawn from the row's generator.

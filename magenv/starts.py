@@ -65,7 +65,9 @@ def place_rows(
                     before[i, robot, j] = measured[i, robot, j]
 
 
-def holding_epms(reference: Floats, system: System, shell: Shell, at_best: bool = False) -> Floats:
+def holding_epms(
+    reference: Floats, system: System, shell: Shell, home_turn: float = 0.0, at_best: bool = False
+) -> Floats:
     """Return EPMs (N, 6) that hold nominal robots at rest at a reference (2, 3), as near home as the solver finds them.
 
     Where commands act late the robots would be gone before the first one, if the EPMs stood at home. Poses out of reach
@@ -81,7 +83,7 @@ def holding_epms(reference: Floats, system: System, shell: Shell, at_best: bool 
     least, best = math.inf, np.empty(0)
     positions = np.zeros((2, 3))
     positions[:, :2] = reference[:, :2]
-    home = home_pose(system.n_epm).reshape(-1, POSE_SIZE)
+    home = home_pose(system.n_epm, home_turn).reshape(-1, POSE_SIZE)
     home[:, [0, 3]] += robots_frame(reference[0, 2], reference[1, 2])
     rng, within = np.random.default_rng(0), narrowed(shell, COMMAND_MARGIN_M)
     for turn in range(_TURNS):

@@ -18,9 +18,10 @@ from tiny_runs import CONFIGS, both, going_on, steps_of, tensors_of
 from agents.checkpoints import checkpoints, save_model, stored_config
 from agents.configs import TrainConfig, command_of
 from agents.controller import Observations
-from agents.evaluation import EPISODES, HeldOut
+from agents.evaluation import EPISODES, HeldOut, Score
 from agents.history import LONGEST, Recalling, recalled
 from agents.history_vec import HistoryVecEnv
+from agents.keeper import Keeper
 from agents.learned import Learned
 from agents.learning import build, train
 from agents.player import normalise
@@ -118,19 +119,28 @@ def test_a_training_runs_goes_on_and_can_be_repeated(algo: str, tmp_path: Path) 
     assert "history" in refusal(lambda: train(going_on(tmp_path / "run", steps=512, history=1)))
 
 
-def test_it_is_judged_as_it_acts(tmp_path: Path) -> None:
-    config = remembering(scenario="approach-60", steps=128, out=tmp_path / "run")
-    train(config)
-    agent, state = Learned(tmp_path / "run" / "model"), None
+def test_it_is_judged_with_what_it_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the held-out episodes, which all begin together, it sees what came before; training does not notice."""
+    config, seen = remembering(scenario="approach-60", steps=128), []
+    original = Keeper._policy
 
-    def predict(observations: Observations) -> NDArray[np.float32]:
-        nonlocal state
-        actions, state = agent.predict(observations, state)
-        return actions
+    def noted(keeper: Keeper, observations: Observations) -> NDArray[np.float32]:
+        seen.append(observations)
+        return original(keeper, observations)
 
-    score = load_card(tmp_path / "run" / "model").score
-    assert score is not None
-    assert HeldOut(config.settings, EPISODES).score(predict).merit == pytest.approx(score.merit, rel=2e-3)
+    with monkeypatch.context() as patch:
+        patch.setattr(Keeper, "_policy", noted)
+        train(dataclasses.replace(config, out=tmp_path / "run"))
+    first = [np.array_equal(one, np.tile(one[:, :SIZE], HISTORY)) for one in seen]
+    assert sum(first) == 2, "of a checkpoint, and of the end"
+    assert {one.shape for one in seen} == {(EPISODES, HISTORY * SIZE)}
+    for before, now, begins in zip(seen, seen[1:], first[1:], strict=False):
+        assert begins or np.array_equal(now[:, :-SIZE], before[:, SIZE:])
+    with monkeypatch.context() as patch:
+        patch.setattr(HeldOut, "score", lambda *_: Score(0.0, 1.0, 1.0, 1.0))
+        train(dataclasses.replace(config, out=tmp_path / "unjudged"))
+    judged, unjudged = tensors_of(tmp_path / "run"), tensors_of(tmp_path / "unjudged")
+    assert all(torch.equal(judged[name], unjudged[name]) for name in judged)
 
 
 def test_the_command_tells_the_history() -> None:
@@ -174,10 +184,36 @@ def test_a_card_that_tells_another_history_is_refused(history: object, told: str
     assert f"received weights for [{HISTORY * SIZE}, {ACTIONS}]" in message
 
 
-def test_memories_of_other_episodes_are_refused() -> None:
+def test_a_card_with_a_history_that_nobody_uses_is_refused(tmp_path: Path) -> None:
+    folder = stored(tmp_path / "model", dataclasses.replace(CONFIGS["ppo"], action=None, residual="tuned"))
+    card = json.loads((folder / CARD).read_text())
+    (folder / CARD).write_text(json.dumps(card | {"history": 3, "config": card["config"] | {"history": 3}}))
+    assert "model's history must be 1 where it corrects a controller; instead received 3" in refusal(
+        lambda: Learned(folder)
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "starts", "told"),
+    [
+        (np.zeros((2, HISTORY, SIZE), np.float32), None, f"of 3 episodes, of shape (3, {HISTORY}, {SIZE})"),
+        (np.zeros((3, HISTORY - 1, SIZE), np.float32), None, "state must be what was seen of 3 episodes"),
+        ((1, 2), None, "state must be what was seen of 3 episodes"),
+        (None, np.ones(2, np.bool_), "episode_start must be of shape (3,); instead received (2,)"),
+    ],
+)
+def test_memories_of_other_episodes_are_refused(state: Any, starts: Any, told: str) -> None:
     policy = Recalling(lambda seen: seen[:, :1], HISTORY)
-    _, past = policy.predict(np.zeros((2, SIZE), np.float32))
-    assert "state must be one of 3 episodes" in refusal(lambda: policy.predict(np.zeros((3, SIZE), np.float32), past))
+    assert told in refusal(lambda: policy.predict(np.zeros((3, SIZE), np.float32), state, starts))
+
+
+def test_starts_may_be_any_truth_values_and_there_may_be_no_episode() -> None:
+    policy, ones = Recalling(lambda seen: seen[:, :1], HISTORY), np.ones((2, SIZE), np.float32)
+    _, past = policy.predict(0.0 * ones)
+    actions, _ = policy.predict(ones, past, np.array([1, 0]))
+    np.testing.assert_array_equal(actions, [[1.0], [0.0]])
+    actions, past = policy.predict(ones[:0])
+    assert (actions.shape, past.shape) == ((0, 1), (0, HISTORY, SIZE))
 
 
 def test_what_is_remembered_is_not_changed_behind_ones_back() -> None:

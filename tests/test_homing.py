@@ -11,6 +11,7 @@ from messages import refusal
 from agents.homing import Homing
 from agents.rollout import run
 from magenv.episodes import Episodes, Settings
+from magenv.poses import to_cartesian
 
 
 def test_it_holds_both_approaches() -> None:
@@ -46,3 +47,14 @@ def test_its_commands_hang_on_no_earlier_ones(n_epm: int) -> None:
 def test_epms_that_travel_are_refused() -> None:
     told = refusal(lambda: Homing(2, 2.0, "arm"))
     assert told == "Input plant must be one whose EPMs jump, for predictive-home; instead received 'arm'."
+
+
+def test_its_home_is_the_plants() -> None:
+    """With another home, other poses serve: those near to that."""
+    centres = []
+    for plant in ("paper", "paper:home_turn_rad=0.977"):
+        (record,) = run(Homing(plant=plant), "approach-60", plant, episodes=1)
+        assert record.success
+        centres.append(to_cartesian(record.epm_pose)[0])
+    tilt = [float(np.median(np.abs(np.arcsin(one[..., 2] / np.linalg.norm(one, axis=-1))))) for one in centres]
+    assert tilt[1] > tilt[0] + 0.15

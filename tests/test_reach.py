@@ -14,7 +14,7 @@ import magenv.starts
 from magenv.actions import Actions, pose_to_action
 from magenv.env import TwoRobots
 from magenv.params import PLANTS, Plant, System, plant_named
-from magenv.poses import from_cartesian, to_cartesian
+from magenv.poses import from_cartesian, home_pose, to_cartesian
 from magenv.reach import Shell, shoulder
 from magenv.starts import holding_epms
 from magenv.trajectories import shaped
@@ -143,6 +143,17 @@ def test_an_episode_begins_within_reach() -> None:
         env = TwoRobots(plant=plant)
         for seed in range(10):
             assert beyond(to_cartesian(env.reset(seed=seed)[1]["epm_pose"])[0]) <= 1e-9
+
+
+def test_where_epms_accelerate_an_episode_begins_as_near_home_as_robots_can_be_held() -> None:
+    """Whatever home is: the mean way from either home is least for the plant that has it."""
+    ways = []
+    for plant in ("arm", "arm:home_turn_rad=0.977"):
+        held = TwoRobots("approach-60", plant).reset(seed=0)[1]["epm_pose"]
+        homes = [home_pose(2, plant_named(name).home_turn_rad) for name in ("arm", "arm:home_turn_rad=0.977")]
+        ways.append([np.linalg.norm(to_cartesian(held)[0] - to_cartesian(home)[0]) for home in homes])
+    assert ways[0][0] < ways[0][1]
+    assert ways[1][1] < ways[1][0]
 
 
 def test_a_start_that_no_arm_can_hold_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
