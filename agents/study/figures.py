@@ -21,7 +21,7 @@ from agents.study.evidence import Measured, OfEpisodes, mean_kept, success_rate
 
 Floats = NDArray[np.float64]
 
-_COLOURS = ("#0072B2", "#56B4E9", "#CC79A7", "#000000", "#8C510A", "#7B3294", "#666666", "#117733")
+_COLOURS = ("#0072B2", "#56B4E9", "#CC79A7", "#999933", "#8C510A", "#7B3294", "#666666", "#117733")
 """Of agents, in their order; those of controllers are others."""
 _INK, _GRID = "#222222", "#E5E5E5"
 _POINTS = 150
@@ -31,6 +31,10 @@ _COLUMNS = 4
 _LABELS = {"position_error_mm": "position error (mm)", "heading_error_deg": "heading error (degrees)"}
 _BAND = 0.14
 """Opacity of bands."""
+_UPWARDS, _ALONG = (1.0, 2.0, 5.0), (1.0, 3.0)
+"""Numbers of a decade: upwards there is room for more."""
+_LETTERS = 165
+"""Of a legend's line."""
 
 
 def style(one: Measured, measured: Sequence[Measured]) -> dict[str, object]:
@@ -62,7 +66,7 @@ def overview(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
                     axes.plot(at[:1], [np.median(values)], mark, color=colour, markersize=8, markeredgewidth=0)
         if title != rows[0][0] and any(len(line.get_xdata()) > 0 for line in axes.lines):  # else all were lost
             axes.set_yscale("log")
-            _plain_numbers(axes.yaxis)
+            _plain_numbers(axes.yaxis, _UPWARDS)
         for border in range(1, len(scenarios)):
             axes.axvline(border - 0.5, color=_GRID, linewidth=1.0)
         axes.set_ylabel(title, fontsize=11)
@@ -86,7 +90,7 @@ def overview(measured: Sequence[Measured], scenarios: Sequence[str]) -> Figure:
     ]
     if any(len(one.made) > 1 for one in measured):
         handles.append(Line2D([], [], linestyle="", marker="o", markersize=4, alpha=0.5, color=_INK, label="each seed"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)
+    _legend_below(figure, handles)
     return figure
 
 
@@ -162,7 +166,7 @@ def _profile(axes: Axes, errors: Floats, thresholds: Floats, line: dict[str, obj
 def _profile_axes(axes: Axes, thresholds: Floats) -> None:
     axes.set_xscale("log")
     axes.set_xlim(thresholds[0], thresholds[-1])
-    _plain_numbers(axes.xaxis)
+    _plain_numbers(axes.xaxis, _ALONG)
     axes.set_ylim(-3.0, 103.0)
     _grid(axes)
 
@@ -186,10 +190,10 @@ def curves(measured: Sequence[Measured], group: str) -> Figure:
             for one in measured:
                 _curve(axes, [(along(made.curve), values(made.curve)) for made in one.made], style(one, measured))
             axes.set_xscale("log")
-            _plain_numbers(axes.xaxis)
+            _plain_numbers(axes.xaxis, _ALONG)
             if title != rows[0][0]:
                 axes.set_yscale("log")
-                _plain_numbers(axes.yaxis)
+                _plain_numbers(axes.yaxis, _UPWARDS)
             _grid(axes)
     panels[0, 0].set_ylim(-3.0, 103.0)
     for axes, (title, _) in zip(panels[-1], columns, strict=True):
@@ -211,9 +215,9 @@ def _curve(axes: Axes, series: Sequence[tuple[Sequence[float], Sequence[float]]]
     axes.fill_between(grid, values.min(axis=0), values.max(axis=0), color=str(line["color"]), alpha=_BAND, linewidth=0)
 
 
-def _plain_numbers(axis: Axis) -> None:
+def _plain_numbers(axis: Axis, per_decade: tuple[float, ...]) -> None:
     """Write no powers of ten on a logarithmic axis, and more than one number a decade."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=per_decade))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -234,4 +238,11 @@ def _legend(figure: Figure, chosen: Sequence[Measured], measured: Sequence[Measu
     ]
     if any(len(one.made) > 1 for one in chosen):
         handles.append(Patch(color=_INK, alpha=_BAND, linewidth=0, label=band))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=10)
+    _legend_below(figure, handles)
+
+
+def _legend_below(figure: Figure, handles: Sequence[Line2D | Patch]) -> None:
+    """Draw a legend below all panels, in as many columns as find room."""
+    longest = max(len(str(handle.get_label())) for handle in handles) + 6
+    columns = max(1, min(4, len(handles), _LETTERS // longest))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=10)
