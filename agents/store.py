@@ -61,6 +61,8 @@ class Card:
     """What the policy corrects; None where it acts by itself."""
     history: int = 1
     """How many of its episode's last observations it sees."""
+    limits: str = ""
+    """What it holds and what not, in words; of agents that ship."""
 
     @classmethod
     def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
@@ -147,7 +149,7 @@ def load_card(folder: Path) -> Card:
     ------
     ValueError
         If the folder holds no magenv model, the card is damaged or contradicts itself, or another major version of
-        magenv made it.
+        magenv made it; before the first one, another minor version.
     """
     path = Path(folder) / CARD
     require(path.is_file(), "model", f"a folder with {CARD}", str(folder))
@@ -177,11 +179,13 @@ def load_card(folder: Path) -> Card:
         ("config", card.config, dict),
         ("versions", card.versions, dict),
         ("command", card.command, str),
+        ("limits", card.limits, str),
     ):
         require(isinstance(value, kind), f"model's {name}", f"of type {kind.__name__}", value)
     made, own = card.versions.get("magenv"), version("magenv")
-    same = isinstance(made, str) and made.split(".")[0] == own.split(".")[0]
-    require(same, "model", f"of the major version of magenv {own}", made)
+    told = 2 if own.startswith("0.") else 1  # before the first major version, minor ones may break
+    same = isinstance(made, str) and made.split(".")[:told] == own.split(".")[:told]
+    require(same, "model", f"of magenv {'.'.join(own.split('.')[:told])}, as this one", made)
     bound = dataclasses.asdict(card.settings) | {"history": card.history}
     for name, value in bound.items():  # a mode of the same size would go unnoticed
         trained = card.config.get(name)

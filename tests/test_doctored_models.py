@@ -127,6 +127,7 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "other control_hz": lambda card: card["settings"].update(control_hz=4.0),
     "no version": lambda card: card.update(versions={}),
     "other version": lambda card: card["versions"].update(magenv="7.1.0"),
+    "other minor version": lambda card: card["versions"].update(magenv="0.2.0"),
     "version a number": lambda card: card["versions"].update(magenv=0.1),
     "residual a text": lambda card: card.update(residual="tuned"),
     "residual of nobody": lambda card: card.update(residual={"controller": "nobody", "scale": 0.1}),
@@ -200,7 +201,8 @@ def test_what_a_policy_is_stored_for_and_what_it_meets_are_both_named(checkpoint
         return refusal(lambda: Learned(copy))
 
     assert "'magenv model 1'; instead received 'magenv model 99'" in told("other format")
-    assert f"magenv {version('magenv')}; instead received '7.1.0'" in told("other version")
+    own = version("magenv").rpartition(".")[0]
+    assert f"of magenv {own}, as this one; instead received '7.1.0'" in told("other version")
     assert "action must be 'home', as in its training; instead received 'pose'" in told("action of its size")
     assert "frame must be 'robots', as in its training; instead received 'global'" in told("frame of its size")
     assert "control_hz must be 2.0, as in its training; instead received 4.0" in told("other control_hz")

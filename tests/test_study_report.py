@@ -22,7 +22,7 @@ from agents.ladder_run import run_ladder
 from agents.report import three_digits
 from agents.statistics import interval, probability_of_improvement
 from agents.study import entries, report
-from agents.study.entries import Entry
+from agents.study.entries import Entry, Outcomes
 from agents.study.evidence import collect
 from agents.study.figures import curves, profiles
 from agents.study.trainings import MAIN, SCENARIOS, training
@@ -291,6 +291,15 @@ def unlike(**changes: Any) -> Entry:
     return dataclasses.replace(an_entry("ppo-home", 1), **changes)
 
 
+def _with(**value: float | None) -> dict[str, Outcomes]:
+    """Return outcomes of lost episodes, one number of which is another."""
+    outcomes = an_entry("ppo-home", 1, hold=0.0).outcomes
+    ((column, wrong),) = value.items()
+    one = outcomes["eight-30"]
+    changed = dataclasses.replace(one, **{column: (wrong, *getattr(one, column)[1:])})
+    return outcomes | {"eight-30": changed}
+
+
 def test_records_that_do_not_belong_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
     made = unlike().training
     assert made is not None
@@ -300,6 +309,9 @@ def test_records_that_do_not_belong_are_refused_and_nothing_is_written(tmp_path:
         "12 episodes of approach-60": an_entry("ppo-home", 1, episodes=3),
         "same scenarios": unlike(outcomes={"approach-60": unlike().outcomes["approach-60"]}),
         "of a training": unlike(training=None),
+        "measured in": unlike(plant="arm"),
+        "errors of at least 0": unlike(outcomes=_with(heading_error_deg=-1.0)),
+        "of episodes that are lost at a time, or succeed": unlike(outcomes=_with(loss_of_control_s=None)),
     }
     for index, (told, entry) in enumerate(cases.items()):
         store = tmp_path / str(index)

@@ -130,12 +130,14 @@ class Report:
     """Folder of the records."""
     out: Path = Path("docs")
     """Folder of results.md."""
-    ladder: tuple[Path, ...] = ()
-    """Files ladder.json of evaluate.py --ladder, for a figure of success over separation."""
+    ladder: tuple[Path, ...] | None = None
+    """Files ladder.json of evaluate.py --ladder, for a figure of success over separation; by default those in folders
+    ladder-... beside the store."""
 
     def do(self) -> None:
         """Read, draw, write."""
-        print(f"Results: {write_results(self.store, self.out, self.ladder)}")
+        ladders = sorted(self.store.parent.glob("ladder-*/ladder.json")) if self.ladder is None else self.ladder
+        print(f"Results: {write_results(self.store, self.out, ladders)}")
 
 
 @dataclass(frozen=True)

@@ -204,6 +204,12 @@ def _entry(raw: dict[str, Any]) -> Entry:
     """Return an entry from what JSON makes of it; raises where it is none."""
     require(isinstance(raw.get("outcomes"), dict) and len(raw["outcomes"]) > 0, "outcomes", "of scenarios", "none")
     outcomes = {name: _whole(Outcomes, value) for name, value in raw["outcomes"].items()}
+    for of_scenario in outcomes.values():
+        errors = (*of_scenario.position_error_mm, *of_scenario.heading_error_deg)
+        require(min(errors) >= 0.0, "outcomes", "of errors of at least 0", min(errors))
+        lost = tuple(time is not None for time in of_scenario.loss_of_control_s)
+        fits = all(kept != gone for kept, gone in zip(of_scenario.success, lost, strict=True))
+        require(fits, "outcomes", "of episodes that are lost at a time, or succeed", "others")
     made = raw["training"]
     if made is not None:
         made = _read(Made, made | {"curve": _whole(Curve, made["curve"])})

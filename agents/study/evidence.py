@@ -127,7 +127,12 @@ def collect(store: Path) -> list[Measured]:
         agent = entry.name in trainings.names()
         require(agent == (entry.training is not None), str(path), "an agent's if it is of a training", entry.name)
         if entry.training is not None:
-            check_told(entry.training.config, trainings.training(entry.name).of_seed(entry.training.seed), str(path))
+            config = trainings.training(entry.name).of_seed(entry.training.seed)
+            check_told(entry.training.config, config, str(path))
+            wanted = (Where(config.plant, config.n_epm, config.control_hz), config.settings.action)
+            require(
+                (entry.where, entry.action) == wanted, str(path), f"measured in {wanted}", (entry.where, entry.action)
+            )
     _check_episodes(entries, store)
     measured = []
     for name in known:

@@ -149,7 +149,7 @@ def profiles_by_scenario(measured: Sequence[Measured], scenarios: Sequence[str])
 
 def _thresholds(errors: Sequence[Floats]) -> Floats:
     """Return thresholds over the range of all finite errors."""
-    finite = np.concatenate([np.zeros(0), *(each[np.isfinite(each)] for each in errors)])
+    finite = np.concatenate([np.zeros(0), *(each[np.isfinite(each) & (each > 0.0)] for each in errors)])
     low, high = (0.8 * finite.min(), 1.25 * finite.max()) if len(finite) else (0.1, 10.0)
     return np.geomspace(low, high, _POINTS)
 

@@ -39,9 +39,12 @@ _IMPROVEMENT = """\
 The chance that an agent errs less in position than a controller on the same episode, mean over episodes and seeds; \
 lost episodes are the worst, and if both are lost it counts half. In brackets the 95 % bootstrap interval over whole \
 seeds. 0.5 means that neither is better. Ablations are left out."""
+_TIMES = "Steps and minutes are those of the training without its measurement, on cores that others may have shared."
 _CURVES = """\
 Success and errors in training, means over its last 200 episodes, which are drawn from the scenario trained on, \
-explored with noise and counted until their end or loss: they are not the errors of the tables. Lines are medians over \
+explored with noise and counted until their end or loss: they are not the errors of the tables. Only lost ones are so \
+short that they end in the first 200 steps of all environments side by side, and so it is where a training was broken \
+off and gone on with. Lines are medians over \
 the seeds, bands reach from the least to the greatest. Times are those of the machines below."""
 
 
@@ -63,7 +66,8 @@ def write_results(store: Path, out: Path, ladders: Sequence[Path] = ()) -> Path:
         If records or ladders are unsound, or ``out`` cannot be written; nothing is written then.
     """
     measured = collect(store)
-    rungs = [rung for path in ladders for rung in load_ladder(path)[1]]
+    climbs = [load_ladder(path) for path in ladders]
+    rungs = [rung for _, climbed in climbs for rung in climbed]
     check_output_dir(out)
     scenarios = [scenario for scenario in scenarios_of(measured) if scenario in SCENARIOS] or scenarios_of(measured)
     controllers = [one for one in measured if one.training is None and one.where == USUAL]
@@ -100,7 +104,7 @@ def write_results(store: Path, out: Path, ladders: Sequence[Path] = ()) -> Path:
         page += picture(name, f"Success and errors in training, {group}", figures.curves(agents, group))
     if rungs:
         page += ["", "## How close", "", *picture("ladder", "Success over separation", ladder_figures.draw(rungs))]
-        page += ["", ladder_figures.tables(rungs)]
+        page += ["", ladder_figures.tables(rungs), "", *(f"- `{told['command']}`" for told, _ in climbs)]
     page += ["", "## Where the records come from", "", *_provenance(measured)]
     for name, figure in pictures.items():
         write_file(out / name, png(figure))
@@ -130,4 +134,4 @@ def _provenance(measured: Sequence[Measured]) -> list[str]:
     ):
         lines += [f"{alike}:" if len(found) == 1 else f"{what} differ among the records:", ""]
         lines += [*(f"{number}. {one}" for number, one in enumerate(found, 1)), ""]
-    return [*lines, "Steps and minutes are those of the training alone.", "", *tables.provenance(measured)]
+    return [*lines, _TIMES, "", *tables.provenance(measured)]
