@@ -218,6 +218,9 @@ def _curve(axes: Axes, series: Sequence[tuple[Sequence[float], Sequence[float]]]
 def _plain_numbers(axis: Axis, per_decade: tuple[float, ...]) -> None:
     """Write no powers of ten on a logarithmic axis, and more than one number a decade."""
     axis.set_major_locator(LogLocator(subs=per_decade))
+    low, high = axis.get_view_interval()
+    if sum(low <= at <= high for at in axis.get_majorticklocs()) < 2:  # of a short axis
+        axis.set_major_locator(LogLocator(subs=tuple(range(1, 10))))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
     axis.set_minor_formatter(NullFormatter())
 
