@@ -29,7 +29,7 @@ from magenv.wrench import IN_PLANE, planar_moments, robot_wrench
 
 SCENARIOS = (
     "random, approach-<s>, crossing-<s>, meeting-<s>, eight-<s>, still-<s> or approach-<s>-anti "
-    "with s from 12 to 100 (mm)"
+    "with s from 12 to 100 (mm), or random-<s> with s from 12 to 80"
 )
 CONTROL_HZ = "a number from 0.01 to 1000.0"
 CHANGES = ", ".join(f.name for f in dataclasses.fields(Plant) if f.name != "body")
