@@ -65,13 +65,11 @@ def save_model(
     score: Score | None = None,
 ) -> None:
     """Write the agent as it is now (see ``agents.store``), with its optimisers where asked."""
-    own = config.ppo if config.algo == "ppo" else config.sac
-    card = Card.of(config.algo, own.net, config.settings, model.num_timesteps, config.resolved)
     statistics: Any = env.obs_rms
     training = flatten(_training_state(model, config.algo)) if with_training else None
     save(
         folder,
-        dataclasses.replace(card, command=command, score=score, residual=config.correction, history=config.history),
+        Card.of(config, model.num_timesteps, command, score),
         flatten(dict(model.policy.state_dict())),
         Normalisation(statistics.mean, statistics.var, statistics.count),
         training,

@@ -28,6 +28,11 @@ def check_net(net: tuple[int, ...]) -> None:
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
 
 
+def check_clip(clip: float) -> None:
+    """Raise ``InputError`` unless observations can be cut at so many standard deviations."""
+    _number(0, 1e6, clip_observation=clip)
+
+
 def _whole(least: int, most: float, **values: object) -> None:
     """Raise ``InputError`` unless all values are whole numbers from ``least`` to ``most``."""
     for name, value in values.items():
@@ -156,8 +161,8 @@ class TrainConfig:
     action: ActionMode | None = None
     """What an action means: home, pose, step, wrench or velocity; by default velocity, or as of the controller of
     --residual or --expert."""
-    observation: ObservationMode = "full"
-    """What the agent sees: full or errors."""
+    observation: ObservationMode | None = None
+    """What the agent sees: full or errors; by default the errors where actions are velocities, else all."""
     frame: Frame = "robots"
     """Frame of the observation: robots or global."""
     control_hz: float = 2.0
@@ -165,6 +170,8 @@ class TrainConfig:
     history: int = 1
     """How many of its episode's last observations the agent sees, side by side; one with --residual or --expert. SAC's
     buffer keeps as many of each step."""
+    clip_observation: float = 10.0
+    """Observations, less the mean of all so far, are cut at so many of their standard deviations."""
     residual: str | None = None
     """Name of the controller that the policy corrects (of those of evaluate.py, no learned one)."""
     residual_scale: float = 0.1
@@ -204,6 +211,7 @@ class TrainConfig:
             require(self.tune, "trials", "given with --tune", self.trials)
             _whole(1, math.inf, trials=self.trials)
         check_history(self.history)
+        check_clip(self.clip_observation)
         if self.curriculum is not None:
             own = family_separation(self.scenario)
             require(own is not None, "scenario", "a random family with --curriculum", self.scenario)
@@ -227,6 +235,11 @@ class TrainConfig:
         return None if self.residual is None else Correction(self.residual, self.residual_scale)
 
     @property
+    def own(self) -> PPOConfig | SACConfig:
+        """Hyperparameters of the algorithm."""
+        return self.ppo if self.algo == "ppo" else self.sac
+
+    @property
     def curriculum_m(self) -> tuple[float, float]:
         """The least separation (m) at first, and in the end; of a training with a curriculum."""
         own = family_separation(self.scenario)
@@ -243,15 +256,16 @@ class TrainConfig:
 
     @property
     def resolved(self) -> TrainConfig:
-        """The same training with its action mode told, whichever it is by default."""
-        return replace(self, action=self.settings.action)
+        """The same training with its modes of action and observation told, whichever they are by default."""
+        return replace(self, action=self.settings.action, observation=self.settings.observation)
 
     @property
     def settings(self) -> Settings:
         """The environment."""
         shown = self.expert or self.residual
         action = self.action or ("velocity" if shown is None else CLASSICAL[shown].action)
-        return Settings(self.scenario, self.plant, self.n_epm, action, self.observation, self.frame, self.control_hz)
+        observation = self.observation or ("errors" if action == "velocity" else "full")
+        return Settings(self.scenario, self.plant, self.n_epm, action, observation, self.frame, self.control_hz)
 
     @property
     def checkpoint_steps(self) -> int:

@@ -25,7 +25,6 @@ from agents.folders import lock_folder, new_folder
 from agents.history_vec import HistoryVecEnv
 from agents.keeper import Keeper, Watch
 from agents.networks import policy_kwargs
-from agents.player import CLIP_OBSERVATION
 from agents.progress import Reporter, logger
 from agents.residual_vec import ResidualVecEnv
 from agents.sb3_vec import TwoRobotsVecEnv
@@ -42,13 +41,13 @@ def _falling(start: float) -> Any:
 
 def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
     """Return the untrained agent and its normalised environments."""
-    own = config.ppo if config.algo == "ppo" else config.sac
+    own = config.own
     robots: VecEnv = TwoRobotsVecEnv(own.n_envs, config.settings, config.seed)
     if config.correction is not None:
         robots = ResidualVecEnv(robots, config.correction.base(config.settings), config.correction.scale)
     if config.history > 1:
         robots = HistoryVecEnv(robots, config.history)
-    env = VecNormalize(robots, norm_reward=False, clip_obs=CLIP_OBSERVATION)
+    env = VecNormalize(robots, norm_reward=False, clip_obs=config.clip_observation)
     kwargs = policy_kwargs(config.algo, own.net)
     if isinstance(own, PPOConfig):
         kwargs["log_std_init"] = own.log_std_init

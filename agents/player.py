@@ -15,18 +15,15 @@ from magenv.params import InputError, require
 Floats = NDArray[np.float64]
 Shapes = dict[str, tuple[int, ...]]
 
-CLIP_OBSERVATION = 5.0
-"""Normalised observations are clipped here, in training as in use."""
-
 _HIDDEN = {"ppo": "mlp_extractor.policy_net", "sac": "actor.latent_pi"}
 _LAST = {"ppo": "action_net", "sac": "actor.mu"}
 ALGORITHMS = tuple(_HIDDEN)
 
 
-def normalise(observation: Observations, statistics: Normalisation) -> Observations:
-    """Return observations less their mean over their standard deviation, as ``VecNormalize`` does, clipped."""
+def normalise(observation: Observations, statistics: Normalisation, clip: float) -> Observations:
+    """Return observations less their mean over their standard deviation, cut at ``clip``, as ``VecNormalize`` does."""
     scaled = (observation - statistics.mean) / np.sqrt(statistics.variance + 1e-8)
-    return np.clip(scaled, -CLIP_OBSERVATION, CLIP_OBSERVATION).astype(np.float32)
+    return np.clip(scaled, -clip, clip).astype(np.float32)
 
 
 def _linear(name: str, inputs: int, outputs: int) -> Shapes:
@@ -86,7 +83,7 @@ class Player:
         for told in (statistics.mean, statistics.variance):
             require(told.shape == size, "model", f"statistics of shape {size}", told.shape)
         self._squashed = card.algo == "sac"
-        self._statistics = statistics
+        self._statistics, self._clip = statistics, card.clip_observation
         names = [f"{_HIDDEN[card.algo]}.{2 * i}" for i in range(len(card.net))] + [_LAST[card.algo]]
         both = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
         self._layers = [(weight.T.astype(np.float64), bias.astype(np.float64)) for weight, bias in both]
@@ -94,7 +91,7 @@ class Player:
 
     def _check_finite(self) -> None:
         """Raise ``ValueError`` unless no observation can bring any layer beyond single precision, as in training."""
-        bound: Floats = np.full(len(self._layers[0][0]), CLIP_OBSERVATION)
+        bound: Floats = np.full(len(self._layers[0][0]), self._clip)
         for weight, bias in self._layers:
             bound = bound @ np.abs(weight) + np.abs(bias)
             finite = bool((bound <= np.finfo(np.float32).max).all())
@@ -103,7 +100,7 @@ class Player:
 
     def __call__(self, observation: Observations) -> Actions:
         """Return actions (..., a) within [-1, 1] for observations (..., d) as the environment tells them."""
-        told: Floats = normalise(observation, self._statistics).astype(np.float64)
+        told: Floats = normalise(observation, self._statistics, self._clip).astype(np.float64)
         *hidden, (weight, bias) = self._layers
         for weights, biases in hidden:
             told = told @ weights + biases

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from agents.configs import check_net
+from agents.configs import TrainConfig, check_clip, check_net
 from agents.evaluation import Score
 from agents.history import check_history
 from agents.residual import Correction
@@ -53,6 +53,8 @@ class Card:
     """The training's whole configuration."""
     versions: dict[str, str]
     """Of the packages that made it."""
+    clip_observation: float
+    """Standard deviations at which it sees observations cut."""
     command: str = ""
     """Command that made it."""
     score: Score | None = None
@@ -65,12 +67,21 @@ class Card:
     """What it holds and what not, in words; of agents that ship."""
 
     @classmethod
-    def of(cls, algo: str, net: tuple[int, ...], settings: Settings, steps: int, config: object) -> Card:
-        """Return the card of a model made now, with a dataclass as configuration."""
-        assert dataclasses.is_dataclass(config)
-        assert not isinstance(config, type)
-        plain = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-        return cls(algo, net, settings, steps, plain, {name: version(name) for name in _PACKAGES})
+    def of(cls, config: TrainConfig, steps: int, command: str = "", score: Score | None = None) -> Card:
+        """Return the card of a model made now."""
+        return cls(
+            algo=config.algo,
+            net=config.own.net,
+            settings=config.settings,
+            steps=steps,
+            config=json.loads(json.dumps(dataclasses.asdict(config.resolved), default=str)),
+            versions={name: version(name) for name in _PACKAGES},
+            clip_observation=config.clip_observation,
+            command=command,
+            score=score,
+            residual=config.correction,
+            history=config.history,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +181,7 @@ def load_card(folder: Path) -> Card:
     except (KeyError, TypeError) as error:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
     check_net(card.net)
+    check_clip(card.clip_observation)
     check_history(card.history)
     alone = card.residual is None
     require(alone or card.history == 1, "model's history", "1 where it corrects a controller", card.history)
@@ -186,7 +198,7 @@ def load_card(folder: Path) -> Card:
     told = 2 if own.startswith("0.") else 1  # before the first major version, minor ones may break
     same = isinstance(made, str) and made.split(".")[:told] == own.split(".")[:told]
     require(same, "model", f"of magenv {'.'.join(own.split('.')[:told])}, as this one", made)
-    bound = dataclasses.asdict(card.settings) | {"history": card.history}
+    bound = dataclasses.asdict(card.settings) | {"history": card.history, "clip_observation": card.clip_observation}
     for name, value in bound.items():  # a mode of the same size would go unnoticed
         trained = card.config.get(name)
         require(trained in (None, value), f"model's {name}", f"{trained!r}, as in its training", value)

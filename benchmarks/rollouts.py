@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import agents
 from agents.networks import load_weights, policy_kwargs
-from agents.player import CLIP_OBSERVATION
 from agents.sb3_vec import TwoRobotsVecEnv
 from agents.store import load_card, load_policy
 from benchmarks.measure import Contestant, Effort, side_by_side
@@ -115,12 +114,12 @@ class Collector:
 
     def __init__(self, env: VecEnv, shipped: bool, steps: int) -> None:
         batch = env.num_envs * steps
-        weights, normalisation = load_policy(SHIPPED)
+        card, (weights, normalisation) = load_card(SHIPPED), load_policy(SHIPPED)
         if shipped:
-            env = VecNormalize(env, training=False, norm_reward=False, clip_obs=CLIP_OBSERVATION)
+            env = VecNormalize(env, training=False, norm_reward=False, clip_obs=card.clip_observation)
             statistics: Any = env.obs_rms
             statistics.mean, statistics.var = normalisation.mean, normalisation.variance
-        kwargs = policy_kwargs("ppo", load_card(SHIPPED).net)
+        kwargs = policy_kwargs("ppo", card.net)
         self._model = PPO("MlpPolicy", env, n_steps=steps, batch_size=batch, seed=0, policy_kwargs=kwargs, device="cpu")
         if shipped:
             load_weights(self._model.policy, weights)

@@ -89,7 +89,7 @@ def test_a_stored_policy_sees_what_it_saw_in_training(algo: str, tmp_path: Path)
     told, starts, state = whole.reset(), np.ones(5, np.bool_), None
     for _ in range(40):
         actions, state = agent.predict(told[:, -SIZE:], state, starts)
-        theirs, _ = model.predict(normalise(told, statistics), deterministic=True)
+        theirs, _ = model.predict(normalise(told, statistics, config.clip_observation), deterministic=True)
         np.testing.assert_allclose(actions, theirs, rtol=0.0, atol=1e-6)
         told, _, starts, _ = whole.step(np.sign(theirs))  # far from home, where episodes end soon
     single, past = agent.predict(told[0, -SIZE:])

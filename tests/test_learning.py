@@ -102,6 +102,14 @@ def test_checkpoints_come_ten_times_a_run_or_more() -> None:
     assert TrainConfig(checkpoint_every=7).checkpoint_steps == 7
 
 
+def test_velocities_are_learned_from_errors_and_poses_from_all_there_is() -> None:
+    assert TrainConfig().settings.observation == "errors"
+    assert TrainConfig(residual="steered").settings.observation == "errors"
+    assert TrainConfig(expert="predictive-home").settings.observation == "full"
+    assert TrainConfig(action="home").settings.observation == "full"
+    assert TrainConfig(observation="full").settings.observation == "full"
+
+
 # The learning rate.
 
 
@@ -176,6 +184,8 @@ def test_an_unsound_configuration_is_refused_before_anything_is_written(make_con
         lambda: TrainConfig(steps=0),
         lambda: TrainConfig(seed=-1),
         lambda: TrainConfig(checkpoint_every=0),
+        lambda: TrainConfig(clip_observation=0.0),
+        lambda: TrainConfig(clip_observation=float("inf")),
         lambda: PPOConfig(n_envs=0),
         lambda: PPOConfig(net=()),
         lambda: PPOConfig(net=(64, 0)),

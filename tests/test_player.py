@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -41,7 +42,16 @@ def sb3_policy(algo: str, net: tuple[int, ...]) -> BasePolicy:
     return policy
 
 
-def some_policy(folder: Path, algo: str, net: tuple[int, ...], size: float) -> tuple[BasePolicy, Normalisation]:
+def card_of(algo: str, net: tuple[int, ...], clip: float = 10.0) -> Card:
+    """Return the card of an untrained policy with these layers, whose observations are cut there."""
+    config = dataclasses.replace(SAVED[algo], clip_observation=clip)
+    own: Any = dataclasses.replace(config.own, net=net)
+    return Card.of(dataclasses.replace(config, **{algo: own}), 0)
+
+
+def some_policy(
+    folder: Path, algo: str, net: tuple[int, ...], size: float, clip: float = 10.0
+) -> tuple[BasePolicy, Normalisation]:
     """Store a policy with random weights and statistics in a folder, and return it."""
     rng, policy = np.random.default_rng(len(net)), sb3_policy(algo, net)
     with torch.no_grad():
@@ -49,8 +59,7 @@ def some_policy(folder: Path, algo: str, net: tuple[int, ...], size: float) -> t
             drawn = rng.normal(0.0, size / value.shape[-1] ** 0.5, value.shape)
             value.copy_(torch.from_numpy(np.clip(drawn, -2.0, 2.0)))
     statistics = Normalisation(rng.normal(size=63), rng.uniform(0.1, 4.0, 63), 1e4)
-    card = Card.of(algo, net, Settings(), 0, SAVED[algo])
-    save(folder, card, flatten(dict(policy.state_dict())), statistics)
+    save(folder, card_of(algo, net, clip), flatten(dict(policy.state_dict())), statistics)
     return policy, statistics
 
 
@@ -68,14 +77,16 @@ def test_the_shapes_are_those_of_the_networks_that_learn(algo: str, net: tuple[i
 
 @both
 @pytest.mark.parametrize("net", NETS)
-@pytest.mark.parametrize(("size", "rounding"), [(0.3, 1e-6), (1.5, 5e-6)])
+@pytest.mark.parametrize(("size", "rounding", "clip"), [(0.3, 1e-6, 10.0), (1.5, 5e-6, 5.0)])
 def test_actions_are_those_of_stable_baselines(
-    algo: str, net: tuple[int, ...], size: float, rounding: float, tmp_path: Path
+    algo: str, net: tuple[int, ...], size: float, rounding: float, clip: float, tmp_path: Path
 ) -> None:
     """But for the rounding of single precision there, which grows with the weights."""
-    policy, statistics = some_policy(tmp_path / "model", algo, net, size)
+    policy, statistics = some_policy(tmp_path / "model", algo, net, size, clip)
     agent, told = Learned(tmp_path / "model"), observations(200)
-    expected, _ = policy.predict(normalise(told, statistics), deterministic=True)
+    seen = normalise(told, statistics, clip)
+    assert (np.abs(seen) == clip).any()
+    expected, _ = policy.predict(seen, deterministic=True)
     actions, state = agent.predict(told)
     assert state is None
     assert actions.dtype == np.float32
@@ -94,7 +105,7 @@ def test_the_shipped_agent_acts_as_in_stable_baselines() -> None:
     load_weights(policy, weights)
     told = statistics.mean + np.sqrt(statistics.variance) * np.random.default_rng(2).normal(size=(500, 63))
     told = told.astype(np.float32)
-    expected, _ = policy.predict(normalise(told, statistics), deterministic=True)
+    expected, _ = policy.predict(normalise(told, statistics, agent.card.clip_observation), deterministic=True)
     np.testing.assert_allclose(agent.predict(told)[0], expected, rtol=0.0, atol=1e-6)
 
 
@@ -146,7 +157,7 @@ def test_weights_that_may_overflow_are_refused(algo: str, name: str, tmp_path: P
     some_policy(tmp_path / "sound", algo, (16, 8), 1.0)
     weights, statistics = load_policy(tmp_path / "sound")
     weights[name] = np.full_like(weights[name], 3e38)
-    save(tmp_path / "model", Card.of(algo, (16, 8), Settings(), 0, SAVED[algo]), weights, statistics)
+    save(tmp_path / "model", card_of(algo, (16, 8)), weights, statistics)
     assert "weights that give finite actions" in refusal(lambda: Learned(tmp_path / "model"))
 
 

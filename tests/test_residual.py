@@ -174,7 +174,7 @@ def test_a_stored_policy_acts_as_its_controller_and_a_share_of_its_own(algo: str
         starts = np.array(start)
         actions, state = agent.predict(observations, state, starts)
         own, told_state = base.predict(observations, told_state, starts)
-        seen = normalise(with_base(observations, own), load_policy(tmp_path / "model")[1])
+        seen = normalise(with_base(observations, own), load_policy(tmp_path / "model")[1], config.clip_observation)
         theirs, _ = model.predict(seen, deterministic=True)
         assert np.abs(theirs).max() > 0.0
         np.testing.assert_allclose(actions, np.clip(own + 0.05 * theirs, -1.0, 1.0), rtol=0.0, atol=1e-6)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from agents.checkpoints import GOING_ON
@@ -48,16 +49,19 @@ CLONE_PPO = PPOConfig(learning_rate=2e-4, log_std_init=-3.5)
 SHORT, HOME_SHORT = 200_000, 1_000_000
 """Steps of trainings that are compared with each other alone, in velocities and in offsets from home."""
 
+AT_5 = partial(TrainConfig, clip_observation=5.0)
+"""Trainings that were done when observations were cut there; what that costs, `ppo-clip-5` tells."""
+
 TRAININGS = (
     Training(
         "ppo-home",
         "PPO by offsets from the home configuration",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000),
+        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000),
     ),
-    Training("sac-home", "SAC by offsets from the home configuration", TrainConfig(algo="sac", action="home")),
+    Training("sac-home", "SAC by offsets from the home configuration", AT_5(algo="sac", action="home")),
     Training(
         "ppo-velocity",
-        "PPO as it comes: velocities of the robots, that steering turns into poses",
+        "PPO as it comes: pose errors make velocities of the robots, that steering turns into poses",
         seeds=(0, 1, 2, 3, 4),
     ),
     Training("sac-velocity", "SAC as it comes", TrainConfig(algo="sac")),
@@ -76,114 +80,119 @@ TRAININGS = (
     Training(
         "clone-predictive",
         "PPO that begins as a clone of `predictive-home`, in absolute poses",
-        TrainConfig(expert="predictive-home", ppo=CLONE_PPO, cloning=CloningConfig(steps=32), steps=1_000_000),
+        AT_5(expert="predictive-home", ppo=CLONE_PPO, cloning=CloningConfig(steps=32), steps=1_000_000),
         group="ablation: action",
     ),
     Training(
         "ppo-pose",
         "absolute poses of the EPMs",
-        TrainConfig(action="pose", ppo=HOME_PPO, steps=3_000_000),
+        AT_5(action="pose", ppo=HOME_PPO, steps=3_000_000),
         group="ablation: action",
     ),
     Training(
         "ppo-step",
         "changes of the EPMs' poses",
-        TrainConfig(action="step", ppo=HOME_PPO, steps=3_000_000),
+        AT_5(action="step", ppo=HOME_PPO, steps=3_000_000),
         group="ablation: action",
     ),
     Training(
         "ppo-wrench",
         "wrenches that an optimiser allocates",
-        TrainConfig(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=300_000),
+        AT_5(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=300_000),
         group="ablation: action",
     ),
     Training(
         "short",
-        "`ppo-velocity` in fewer steps",
-        TrainConfig(steps=SHORT),
+        "`ppo-full` in fewer steps",
+        AT_5(observation="full", steps=SHORT),
         group="ablation: observation",
         compared_with=("ppo-velocity",),
     ),
     Training(
-        "short-global", "the global frame", TrainConfig(frame="global", steps=SHORT), group="ablation: observation"
+        "short-global",
+        "the global frame",
+        AT_5(observation="full", frame="global", steps=SHORT),
+        group="ablation: observation",
     ),
     Training(
         "short-errors",
-        "pose errors alone",
-        TrainConfig(observation="errors", steps=SHORT),
+        "`ppo-clip-5` in fewer steps",
+        AT_5(steps=SHORT),
         group="ablation: observation",
     ),
     Training(
-        "ppo-errors",
-        "pose errors alone, in as many steps as `ppo-velocity`",
-        TrainConfig(observation="errors"),
+        "ppo-full",
+        "all that there is to see, cut at 5 standard deviations",
+        AT_5(observation="full"),
+        seeds=(0, 1, 2, 3, 4),
         group="ablation: observation",
     ),
+    Training("ppo-clip-5", "observations cut at 5 standard deviations", AT_5(), group="ablation: observation"),
     Training(
         "short-one",
         "one scenario alone, `approach-30`, instead of the random family",
-        TrainConfig(scenario="approach-30", steps=SHORT),
+        AT_5(observation="full", scenario="approach-30", steps=SHORT),
         group="ablation: trajectories",
         compared_with=("short",),
     ),
     Training(
         "short-curriculum",
         "`short` that begins with robots 60 mm apart and more",
-        TrainConfig(curriculum=60.0, steps=SHORT),
+        AT_5(observation="full", curriculum=60.0, steps=SHORT),
         group="ablation: trajectories",
         compared_with=("short",),
     ),
     Training(
         "home-curriculum",
         "`home-short` that begins with robots 60 mm apart and more",
-        TrainConfig(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
+        AT_5(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
         group="ablation: trajectories",
         compared_with=("home-short",),
     ),
     Training(
         "home-short",
         "`ppo-home` in fewer steps",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
+        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
         group="ablation: home",
         compared_with=("ppo-home",),
     ),
     Training(
         "home-level",
         "EPMs that stand on a level with the robots at home",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=-0.593"),
+        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=-0.593"),
         group="ablation: home",
     ),
     Training(
         "home-upright",
         "EPMs that stand above and below the robots at home",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=0.977"),
+        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=0.977"),
         group="ablation: home",
     ),
     Training(
         "residual-three",
         "PPO that corrects `steered`",
-        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
+        AT_5(observation="full", residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
         group="three EPMs",
     ),
-    Training("ppo-three", "PPO as it comes", TrainConfig(n_epm=3, steps=SHORT), group="three EPMs"),
+    Training("ppo-three", "PPO as it comes", AT_5(observation="full", n_epm=3, steps=SHORT), group="three EPMs"),
     Training(
         "residual-10hz",
         "PPO that corrects `steered`",
-        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
+        AT_5(observation="full", residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
         group="10 Hz",
         scenarios=("approach-30", "approach-22.5", "approach-20"),
     ),
     Training(
         "arm-home",
         "PPO by offsets from the home configuration, trained on `arm`, where all parameters are drawn anew",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
+        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
         group="arms",
         scenarios=("approach-60", "approach-30"),
     ),
     Training(
         "arm-history",
         "`arm-home` that sees its last four observations",
-        TrainConfig(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm", history=4),
+        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm", history=4),
         group="arms",
         scenarios=("approach-60", "approach-30"),
     ),
