@@ -162,7 +162,8 @@ class TrainConfig:
     """What an action means: home, pose, step, wrench or velocity; by default velocity, or as of the controller of
     --residual or --expert."""
     observation: ObservationMode | None = None
-    """What the agent sees: full or errors; by default the errors where actions are velocities, else all."""
+    """What the agent sees: full or errors; by default errors where its actions are velocities, full where they are
+    others or correct a controller."""
     frame: Frame = "robots"
     """Frame of the observation: robots or global."""
     control_hz: float = 2.0
@@ -264,7 +265,7 @@ class TrainConfig:
         """The environment."""
         shown = self.expert or self.residual
         action = self.action or ("velocity" if shown is None else CLASSICAL[shown].action)
-        observation = self.observation or ("errors" if action == "velocity" else "full")
+        observation = self.observation or ("errors" if action == "velocity" and self.residual is None else "full")
         return Settings(self.scenario, self.plant, self.n_epm, action, observation, self.frame, self.control_hz)
 
     @property

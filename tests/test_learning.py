@@ -104,7 +104,8 @@ def test_checkpoints_come_ten_times_a_run_or_more() -> None:
 
 def test_velocities_are_learned_from_errors_and_poses_from_all_there_is() -> None:
     assert TrainConfig().settings.observation == "errors"
-    assert TrainConfig(residual="steered").settings.observation == "errors"
+    assert TrainConfig(expert="steered").settings.observation == "errors"
+    assert TrainConfig(residual="steered").settings.observation == "full"
     assert TrainConfig(expert="predictive-home").settings.observation == "full"
     assert TrainConfig(action="home").settings.observation == "full"
     assert TrainConfig(observation="full").settings.observation == "full"

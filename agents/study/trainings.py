@@ -171,14 +171,14 @@ TRAININGS = (
     Training(
         "residual-three",
         "PPO that corrects `steered`",
-        AT_5(observation="full", residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
+        AT_5(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
         group="three EPMs",
     ),
     Training("ppo-three", "PPO as it comes", AT_5(observation="full", n_epm=3, steps=SHORT), group="three EPMs"),
     Training(
         "residual-10hz",
         "PPO that corrects `steered`",
-        AT_5(observation="full", residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
+        AT_5(residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
         group="10 Hz",
         scenarios=("approach-30", "approach-22.5", "approach-20"),
     ),
