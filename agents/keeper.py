@@ -20,8 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.checkpoints import BEST, MODEL, best_so_far, checkpoints, save_model
 from agents.configs import TrainConfig
 from agents.evaluation import EPISODES, EPISODES_CORRECTED, SEED, HeldOut, Score
-from agents.history import Recalling
-from agents.residual import Corrected
+from agents.learned import whole
 from agents.rollout import controller_seed
 from agents.store import NotFiniteError
 from magenv.command import RunError
@@ -136,20 +135,16 @@ class Keeper(BaseCallback):
 
     def _acting(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
         """Return what acts in episodes that all begin at its first call: the policy with all that it goes with."""
-        correction, history = self._config.correction, self._config.history
-        whole: Corrected | Recalling
-        if correction is not None:
-            whole = Corrected(correction.base(self._config.settings), self._policy, correction.scale)
-        elif history > 1:
-            whole = Recalling(self._policy, history)
-        else:
+        config = self._config
+        acting = whole(self._policy, config.settings, config.correction, config.history)
+        if acting is None:
             return self._policy
-        whole.seed(controller_seed(SEED))
+        acting.seed(controller_seed(SEED))
         state, begin = None, True
 
         def predict(observations: NDArray[np.float32]) -> NDArray[np.float32]:
             nonlocal state, begin
-            actions, state = whole.predict(observations, state, np.full(len(observations), begin))
+            actions, state = acting.predict(observations, state, np.full(len(observations), begin))
             begin = False
             return actions
 

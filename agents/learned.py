@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,19 @@ from numpy.typing import NDArray
 from agents.controller import Actions, Observations
 from agents.history import Recalling
 from agents.player import Player
-from agents.residual import Corrected
+from agents.residual import Corrected, Correction
 from agents.store import load_card, load_policy
 from magenv.episodes import Episodes, Settings
 from magenv.params import require
+
+
+def whole(
+    policy: Callable[[Observations], Actions], settings: Settings, correction: Correction | None, history: int
+) -> Corrected | Recalling | None:
+    """Return a policy with what it goes with: the controller it corrects, or its memory; None if it has neither."""
+    if correction is not None:
+        return Corrected(correction.base(settings), policy, correction.scale)
+    return Recalling(policy, history) if history > 1 else None
 
 
 class Learned:
@@ -40,16 +50,11 @@ class Learned:
         self.settings: Settings = card.settings
         episodes = Episodes(1, card.settings)
         self._size, outputs = episodes.layout.size, episodes.actions.size
-        told, correction = card.algo, card.residual
+        correction = card.residual
         inputs = card.history * self._size if correction is None else self._size + outputs
         self._player = Player(card, *load_policy(folder), inputs, outputs)
-        self._whole: Corrected | Recalling | None = None
-        if correction is not None:
-            told = f"{correction.controller}-{card.algo}"
-            self._whole = Corrected(correction.base(card.settings), self._player, correction.scale)
-        elif card.history > 1:
-            self._whole = Recalling(self._player, card.history)
-        self.name = name or told
+        self._whole = whole(self._player, card.settings, correction, card.history)
+        self.name = name or (card.algo if correction is None else f"{correction.controller}-{card.algo}")
         self.action = card.settings.action
         self.observation = card.settings.observation
         self.frame = card.settings.frame

@@ -68,7 +68,7 @@ TRAININGS = (
     Training(
         "residual-steered",
         "PPO that corrects `steered`",
-        TrainConfig(residual="steered", residual_scale=0.2, steps=500_000),
+        AT_5(residual="steered", residual_scale=0.2, steps=500_000),
         seeds=(0, 1, 2, 3, 4),
     ),
     Training(
