@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from agents.classical import CLASSICAL
 from agents.history import check_history
@@ -19,6 +19,7 @@ from magenv.task import Frame, ObservationMode
 from magenv.trajectories import FAMILY_MOST_MM, family_separation
 
 Algo = Literal["ppo", "sac"]
+Activation = Literal["relu", "tanh"]
 _WIDTH_MAX, _DEPTH_MAX = 4096, 8
 
 
@@ -26,6 +27,11 @@ def check_net(net: tuple[int, ...]) -> None:
     """Raise ``InputError`` unless ``net`` is a sensible sequence of layer widths."""
     fits = 1 <= len(net) <= _DEPTH_MAX and all(type(w) is int and 1 <= w <= _WIDTH_MAX for w in net)
     require(fits, "net", f"1 to {_DEPTH_MAX} widths from 1 to {_WIDTH_MAX}", net)
+
+
+def check_activation(activation: object) -> None:
+    """Raise ``InputError`` unless it is a function that hidden layers may have."""
+    require(activation in get_args(Activation), "activation", " or ".join(get_args(Activation)), activation)
 
 
 def check_clip(clip: float) -> None:
@@ -70,13 +76,19 @@ class PPOConfig:
     """Weight of long returns in the advantage."""
     log_std_init: float = -2.5
     """Logarithm of the policy's standard deviation at the start."""
+    learn_std: bool = False
+    """Whether it is learned as well; it then falls, and errors with it: answers to greater ones are forgotten."""
     net: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of policy and value function."""
+    activation: Activation = "relu"
+    """Function of the hidden layers: relu, or tanh, which answers errors greater than usual no more than usual ones."""
 
     def __post_init__(self) -> None:
         check_net(self.net)
+        check_activation(self.activation)
         _whole(1, 65_536, n_envs=self.n_envs, n_steps=self.n_steps, n_epochs=self.n_epochs)
         _whole(2, math.inf, batch_size=self.batch_size)
+        require(type(self.learn_std) is bool, "learn_std", "true or false", self.learn_std)
         _number(0, math.inf, learning_rate=self.learning_rate)
         _number(0, 1, gamma=self.gamma, gae_lambda=self.gae_lambda)
         _number(-20, 2, log_std_init=self.log_std_init)
@@ -103,9 +115,12 @@ class SACConfig:
     """Steps before the first gradient step."""
     net: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor and critic."""
+    activation: Activation = "relu"
+    """Function of the hidden layers: relu or tanh."""
 
     def __post_init__(self) -> None:
         check_net(self.net)
+        check_activation(self.activation)
         _whole(1, 65_536, n_envs=self.n_envs, gradient_steps=self.gradient_steps, batch_size=self.batch_size)
         _whole(1, 10_000_000, buffer_size=self.buffer_size)
         _whole(0, math.inf, learning_starts=self.learning_starts)
@@ -138,7 +153,7 @@ class CloningConfig:
         _number(0, math.inf, learning_rate=self.learning_rate)
 
 
-STEPS: dict[Algo, int] = {"ppo": 1_500_000, "sac": 200_000}
+STEPS: dict[Algo, int] = {"ppo": 1_000_000, "sac": 200_000}
 """Environment steps of a training where none are asked for."""
 
 
@@ -181,7 +196,7 @@ class TrainConfig:
     """Name of a controller that the policy is cloned from before it learns by itself (of those of evaluate.py, no
     learned one; ppo alone)."""
     steps: int | None = None
-    """Environment steps, those of cloning included; by default 1.5 million (ppo) or 200,000 (sac)."""
+    """Environment steps, those of cloning included; by default a million (ppo) or 200,000 (sac)."""
     seed: int = 0
     """Of networks and episodes: the same seed gives the same weights on the same machine."""
     out: Path | None = None

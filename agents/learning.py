@@ -15,6 +15,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.checkpoints import MODEL, check_goes_on, is_run, restore
@@ -48,10 +49,10 @@ def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
     if config.history > 1:
         robots = HistoryVecEnv(robots, config.history)
     env = VecNormalize(robots, norm_reward=False, clip_obs=config.clip_observation)
-    kwargs = policy_kwargs(config.algo, own.net)
+    kwargs = policy_kwargs(own.net, own.activation)
     if isinstance(own, PPOConfig):
         kwargs["log_std_init"] = own.log_std_init
-        return PPO(
+        ppo = PPO(
             "MlpPolicy",
             env,
             n_steps=own.n_steps,
@@ -63,7 +64,10 @@ def build(config: TrainConfig) -> tuple[BaseAlgorithm, VecNormalize]:
             seed=config.seed,
             policy_kwargs=kwargs,
             device="cpu",
-        ), env
+        )
+        assert isinstance(ppo.policy, ActorCriticPolicy)
+        ppo.policy.log_std.requires_grad_(own.learn_std)
+        return ppo, env
     return SAC(
         "MlpPolicy",
         env,

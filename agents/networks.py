@@ -10,13 +10,15 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
+from agents.configs import Activation
 from magenv.params import InputError, require
 
+_ACTIVATIONS: dict[Activation, type[torch.nn.Module]] = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}
 
-def policy_kwargs(algo: str, net: tuple[int, ...]) -> dict[str, Any]:
+
+def policy_kwargs(net: tuple[int, ...], activation: Activation) -> dict[str, Any]:
     """Return the keyword arguments with which Stable-Baselines3 builds the networks that ``agents.player`` plays."""
-    activation = torch.nn.Tanh if algo == "ppo" else torch.nn.ReLU
-    return {"net_arch": list(net), "activation_fn": activation}
+    return {"net_arch": list(net), "activation_fn": _ACTIVATIONS[activation]}
 
 
 def load_weights(policy: BasePolicy, weights: Mapping[str, NDArray[Any]]) -> None:

@@ -53,8 +53,8 @@ def shapes_of(algo: str, net: tuple[int, ...], inputs: int, outputs: int) -> Sha
 class Player:
     """The mode of a stored policy: its mean action within the bounds [-1, 1] that all actions have.
 
-    PPO's hidden layers are hyperbolic tangents, and the mean is clipped; SAC's are rectified, and the mean goes through
-    another tangent. All in double precision: rounding does not depend on how many observations come together.
+    PPO's mean is clipped, SAC's goes through a hyperbolic tangent. All in double precision: rounding does not depend on
+    how many observations come together.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Player:
         size = (inputs,)
         for told in (statistics.mean, statistics.variance):
             require(told.shape == size, "model", f"statistics of shape {size}", told.shape)
-        self._squashed = card.algo == "sac"
+        self._squashed, self._rectified = card.algo == "sac", card.activation == "relu"
         self._statistics, self._clip = statistics, card.clip_observation
         names = [f"{_HIDDEN[card.algo]}.{2 * i}" for i in range(len(card.net))] + [_LAST[card.algo]]
         both = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
@@ -96,7 +96,7 @@ class Player:
             bound = bound @ np.abs(weight) + np.abs(bias)
             finite = bool((bound <= np.finfo(np.float32).max).all())
             require(finite, "model", "weights that give finite actions", f"{float(bound.max()):.2g} at most")
-            bound = bound if self._squashed else np.minimum(bound, 1.0)
+            bound = bound if self._rectified else np.minimum(bound, 1.0)
 
     def __call__(self, observation: Observations) -> Actions:
         """Return actions (..., a) within [-1, 1] for observations (..., d) as the environment tells them."""
@@ -104,7 +104,7 @@ class Player:
         *hidden, (weight, bias) = self._layers
         for weights, biases in hidden:
             told = told @ weights + biases
-            told = np.maximum(told, 0.0) if self._squashed else np.tanh(told)
+            told = np.maximum(told, 0.0) if self._rectified else np.tanh(told)
         mean = told @ weight + bias
         return (np.tanh(mean) if self._squashed else np.clip(mean, -1.0, 1.0)).astype(np.float32)
 

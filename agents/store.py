@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from agents.configs import TrainConfig, check_clip, check_net
+from agents.configs import Activation, TrainConfig, check_activation, check_clip, check_net
 from agents.evaluation import Score
 from agents.history import check_history
 from agents.residual import Correction
@@ -53,6 +53,8 @@ class Card:
     """The training's whole configuration."""
     versions: dict[str, str]
     """Of the packages that made it."""
+    activation: Activation
+    """Of the hidden layers."""
     clip_observation: float
     """Standard deviations at which it sees observations cut."""
     command: str = ""
@@ -76,6 +78,7 @@ class Card:
             steps=steps,
             config=json.loads(json.dumps(dataclasses.asdict(config.resolved), default=str)),
             versions={name: version(name) for name in _PACKAGES},
+            activation=config.own.activation,
             clip_observation=config.clip_observation,
             command=command,
             score=score,
@@ -181,6 +184,7 @@ def load_card(folder: Path) -> Card:
     except (KeyError, TypeError) as error:
         raise InputError(f"Input model must have a whole card; instead received {path} ({error}).") from error
     check_net(card.net)
+    check_activation(card.activation)
     check_clip(card.clip_observation)
     check_history(card.history)
     alone = card.residual is None
@@ -194,10 +198,15 @@ def load_card(folder: Path) -> Card:
         ("limits", card.limits, str),
     ):
         require(isinstance(value, kind), f"model's {name}", f"of type {kind.__name__}", value)
-    made, own = card.versions.get("magenv"), version("magenv")
-    told = 2 if own.startswith("0.") else 1  # before the first major version, minor ones may break
-    same = isinstance(made, str) and made.split(".")[:told] == own.split(".")[:told]
-    require(same, "model", f"of magenv {'.'.join(own.split('.')[:told])}, as this one", made)
+    made, here = card.versions.get("magenv"), version("magenv")
+    told = 2 if here.startswith("0.") else 1  # before the first major version, minor ones may break
+    same = isinstance(made, str) and made.split(".")[:told] == here.split(".")[:told]
+    require(same, "model", f"of magenv {'.'.join(here.split('.')[:told])}, as this one", made)
+    own = card.config.get(card.algo)
+    trained = own.get("activation") if isinstance(own, dict) else None
+    require(
+        trained in (None, card.activation), "model's activation", f"{trained!r}, as in its training", card.activation
+    )
     bound = dataclasses.asdict(card.settings) | {"history": card.history, "clip_observation": card.clip_observation}
     for name, value in bound.items():  # a mode of the same size would go unnoticed
         trained = card.config.get(name)

@@ -119,7 +119,7 @@ class Collector:
             env = VecNormalize(env, training=False, norm_reward=False, clip_obs=card.clip_observation)
             statistics: Any = env.obs_rms
             statistics.mean, statistics.var = normalisation.mean, normalisation.variance
-        kwargs = policy_kwargs("ppo", card.net)
+        kwargs = policy_kwargs(card.net, card.activation)
         self._model = PPO("MlpPolicy", env, n_steps=steps, batch_size=batch, seed=0, policy_kwargs=kwargs, device="cpu")
         if shipped:
             load_weights(self._model.policy, weights)

@@ -13,12 +13,12 @@ import torch
 from safetensors.torch import load_file
 from tiny_runs import PPO_CONFIG, Interrupter, MakeConfig, both, going_on, rows_of, steps_of, tensors_of, total_steps
 
-from agents.checkpoints import checkpoints, save_model
+from agents.checkpoints import MODEL, checkpoints, save_model
 from agents.configs import PPOConfig, SACConfig, TrainConfig
 from agents.learned import Learned
 from agents.learning import build, train
 from agents.rollout import run
-from agents.store import CARD, POLICY, load_card, load_training
+from agents.store import CARD, POLICY, load_card, load_policy, load_training
 from magenv.params import PLANTS, Body, Plant
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -96,7 +96,7 @@ def test_the_model_is_the_last_checkpoint(make_config: MakeConfig) -> None:
 
 
 def test_checkpoints_come_ten_times_a_run_or_more() -> None:
-    assert TrainConfig().checkpoint_steps == 150_000
+    assert TrainConfig().checkpoint_steps == 100_000
     assert TrainConfig(algo="sac").checkpoint_steps == 20_000
     assert TrainConfig(steps=5).checkpoint_steps == 1
     assert TrainConfig(checkpoint_every=7).checkpoint_steps == 7
@@ -109,6 +109,16 @@ def test_velocities_are_learned_from_errors_and_poses_from_all_there_is() -> Non
     assert TrainConfig(expert="predictive-home").settings.observation == "full"
     assert TrainConfig(action="home").settings.observation == "full"
     assert TrainConfig(observation="full").settings.observation == "full"
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_standard_deviation_that_is_not_learned_stays(make_config: MakeConfig, learned: bool) -> None:
+    """As it began, and through a resume, where its optimiser has nothing to go on with."""
+    ppo = dataclasses.replace(PPO_CONFIG.ppo, learn_std=learned)
+    train(make_config(ppo=ppo))
+    train(going_on(make_config().out, steps=1024))
+    last = load_policy(make_config().out / MODEL)[0]["log_std"]
+    assert (last == np.float32(ppo.log_std_init)).all() == (not learned)
 
 
 # The learning rate.
@@ -192,6 +202,8 @@ def test_an_unsound_configuration_is_refused_before_anything_is_written(make_con
         lambda: PPOConfig(net=(64, 0)),
         lambda: PPOConfig(learning_rate=float("nan")),
         lambda: PPOConfig(gamma=1.5),
+        lambda: PPOConfig(activation="elu"),  # type: ignore[arg-type]
+        lambda: PPOConfig(learn_std="no"),  # type: ignore[arg-type]
         lambda: PPOConfig(gae_lambda=-0.1),
         lambda: PPOConfig(log_std_init=float("inf")),
         lambda: PPOConfig(n_envs=1, n_steps=1, batch_size=1),

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from tiny_runs import SAVED, both
 
 from agents.catalogue import controller
+from agents.configs import Activation
 from agents.learned import Learned
 from agents.networks import flatten, load_weights, policy_kwargs
 from agents.player import normalise, shapes_of
@@ -31,35 +32,35 @@ SHIPPED = ROOT / "agents" / "data" / "home-ppo"
 NETS = [(16, 8), (32,), (8, 8, 12)]
 
 
-def sb3_policy(algo: str, net: tuple[int, ...]) -> BasePolicy:
+def sb3_policy(algo: str, net: tuple[int, ...], activation: Activation = "relu") -> BasePolicy:
     """Return the untrained policy of Stable-Baselines3 in the default environment."""
     spaces = Episodes(1, Settings())
     kind: Any = PPOPolicy if algo == "ppo" else SACPolicy
     policy: BasePolicy = kind(
-        spaces.observation_space, spaces.action_space, lr_schedule=lambda _: 0.0, **policy_kwargs(algo, net)
+        spaces.observation_space, spaces.action_space, lr_schedule=lambda _: 0.0, **policy_kwargs(net, activation)
     )
     policy.set_training_mode(False)
     return policy
 
 
-def card_of(algo: str, net: tuple[int, ...], clip: float = 10.0) -> Card:
+def card_of(algo: str, net: tuple[int, ...], clip: float = 10.0, activation: Activation = "relu") -> Card:
     """Return the card of an untrained policy with these layers, whose observations are cut there."""
     config = dataclasses.replace(SAVED[algo], clip_observation=clip)
-    own: Any = dataclasses.replace(config.own, net=net)
+    own: Any = dataclasses.replace(config.own, net=net, activation=activation)
     return Card.of(dataclasses.replace(config, **{algo: own}), 0)
 
 
 def some_policy(
-    folder: Path, algo: str, net: tuple[int, ...], size: float, clip: float = 10.0
+    folder: Path, algo: str, net: tuple[int, ...], size: float, clip: float = 10.0, activation: Activation = "relu"
 ) -> tuple[BasePolicy, Normalisation]:
     """Store a policy with random weights and statistics in a folder, and return it."""
-    rng, policy = np.random.default_rng(len(net)), sb3_policy(algo, net)
+    rng, policy = np.random.default_rng(len(net)), sb3_policy(algo, net, activation)
     with torch.no_grad():
         for value in policy.parameters():
             drawn = rng.normal(0.0, size / value.shape[-1] ** 0.5, value.shape)
             value.copy_(torch.from_numpy(np.clip(drawn, -2.0, 2.0)))
     statistics = Normalisation(rng.normal(size=63), rng.uniform(0.1, 4.0, 63), 1e4)
-    save(folder, card_of(algo, net, clip), flatten(dict(policy.state_dict())), statistics)
+    save(folder, card_of(algo, net, clip, activation), flatten(dict(policy.state_dict())), statistics)
     return policy, statistics
 
 
@@ -77,12 +78,13 @@ def test_the_shapes_are_those_of_the_networks_that_learn(algo: str, net: tuple[i
 
 @both
 @pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("activation", get_args(Activation))
 @pytest.mark.parametrize(("size", "rounding", "clip"), [(0.3, 1e-6, 10.0), (1.5, 5e-6, 5.0)])
 def test_actions_are_those_of_stable_baselines(
-    algo: str, net: tuple[int, ...], size: float, rounding: float, clip: float, tmp_path: Path
+    algo: str, net: tuple[int, ...], size: float, rounding: float, clip: float, activation: Activation, tmp_path: Path
 ) -> None:
     """But for the rounding of single precision there, which grows with the weights."""
-    policy, statistics = some_policy(tmp_path / "model", algo, net, size, clip)
+    policy, statistics = some_policy(tmp_path / "model", algo, net, size, clip, activation)
     agent, told = Learned(tmp_path / "model"), observations(200)
     seen = normalise(told, statistics, clip)
     assert (np.abs(seen) == clip).any()
@@ -92,7 +94,7 @@ def test_actions_are_those_of_stable_baselines(
     assert actions.dtype == np.float32
     assert np.abs(actions).max() <= 1.0
     assert len(np.unique(actions)) > 100
-    assert (np.abs(actions) > 0.999).any() == (size > 1.0), "bounds are to be met by some and not by others"
+    assert (np.abs(actions) > 0.97).any() == (size > 1.0), "bounds are to be come near to by some and not by others"
     np.testing.assert_allclose(actions, expected, rtol=0.0, atol=rounding)
     rows = np.stack([agent.predict(row)[0] for row in told])
     np.testing.assert_allclose(rows, actions, rtol=0.0, atol=1e-7)
@@ -100,7 +102,7 @@ def test_actions_are_those_of_stable_baselines(
 
 def test_the_shipped_agent_acts_as_in_stable_baselines() -> None:
     agent = Learned(SHIPPED)
-    policy = sb3_policy("ppo", agent.card.net)
+    policy = sb3_policy("ppo", agent.card.net, agent.card.activation)
     weights, statistics = load_policy(SHIPPED)
     load_weights(policy, weights)
     told = statistics.mean + np.sqrt(statistics.variance) * np.random.default_rng(2).normal(size=(500, 63))

@@ -41,34 +41,43 @@ class Training:
         return dataclasses.replace(self.config, seed=seed)
 
 
-HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6)
+HOME_PPO = PPOConfig(learning_rate=6e-4, log_std_init=-1.6, learn_std=True, activation="tanh")
 """Poses need more room to explore than velocities."""
 CLONE_PPO = PPOConfig(learning_rate=2e-4, log_std_init=-3.5)
 """A clone is near what it looks for."""
 
-SHORT, HOME_SHORT = 200_000, 1_000_000
+LONG, SHORT, HOME_SHORT = 1_500_000, 200_000, 1_000_000
 """Steps of trainings that are compared with each other alone, in velocities and in offsets from home."""
 
-AT_5 = partial(TrainConfig, clip_observation=5.0)
-"""Trainings that were done when observations were cut there; what that costs, `ppo-clip-5` tells."""
+EARLIER_PPO = PPOConfig(learn_std=True, activation="tanh")
+EARLIER = partial(TrainConfig, clip_observation=5.0, ppo=EARLIER_PPO)
+"""Trainings that were done when these were the defaults; what that costs, `ppo-narrow` and `ppo-clip-5` tell."""
 
 TRAININGS = (
     Training(
         "ppo-home",
         "PPO by offsets from the home configuration",
-        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000),
+        EARLIER(action="home", ppo=HOME_PPO, steps=3_000_000),
     ),
-    Training("sac-home", "SAC by offsets from the home configuration", AT_5(algo="sac", action="home")),
+    Training(
+        "sac-home",
+        "SAC by offsets from the home configuration",
+        TrainConfig(algo="sac", action="home", clip_observation=5.0),
+    ),
     Training(
         "ppo-velocity",
         "PPO as it comes: pose errors make velocities of the robots, that steering turns into poses",
         seeds=(0, 1, 2, 3, 4),
     ),
-    Training("sac-velocity", "SAC as it comes", TrainConfig(algo="sac")),
+    Training(
+        "sac-velocity",
+        "SAC that sees all there is",
+        TrainConfig(algo="sac", observation="full", clip_observation=5.0),
+    ),
     Training(
         "residual-steered",
         "PPO that corrects `steered`",
-        AT_5(residual="steered", residual_scale=0.2, steps=500_000),
+        EARLIER(residual="steered", residual_scale=0.2, steps=500_000),
         seeds=(0, 1, 2, 3, 4),
     ),
     Training(
@@ -80,119 +89,137 @@ TRAININGS = (
     Training(
         "clone-predictive",
         "PPO that begins as a clone of `predictive-home`, in absolute poses",
-        AT_5(expert="predictive-home", ppo=CLONE_PPO, cloning=CloningConfig(steps=32), steps=1_000_000),
+        EARLIER(
+            expert="predictive-home",
+            ppo=dataclasses.replace(CLONE_PPO, learn_std=True, activation="tanh"),
+            cloning=CloningConfig(steps=32),
+            steps=1_000_000,
+        ),
         group="ablation: action",
     ),
     Training(
         "ppo-pose",
         "absolute poses of the EPMs",
-        AT_5(action="pose", ppo=HOME_PPO, steps=3_000_000),
+        EARLIER(action="pose", ppo=HOME_PPO, steps=3_000_000),
         group="ablation: action",
     ),
     Training(
         "ppo-step",
         "changes of the EPMs' poses",
-        AT_5(action="step", ppo=HOME_PPO, steps=3_000_000),
+        EARLIER(action="step", ppo=HOME_PPO, steps=3_000_000),
         group="ablation: action",
     ),
     Training(
         "ppo-wrench",
         "wrenches that an optimiser allocates",
-        AT_5(action="wrench", ppo=PPOConfig(log_std_init=-3.0), steps=300_000),
+        EARLIER(action="wrench", ppo=dataclasses.replace(EARLIER_PPO, log_std_init=-3.0), steps=300_000),
         group="ablation: action",
     ),
     Training(
         "short",
         "`ppo-full` in fewer steps",
-        AT_5(observation="full", steps=SHORT),
+        EARLIER(observation="full", steps=SHORT),
         group="ablation: observation",
         compared_with=("ppo-velocity",),
     ),
     Training(
         "short-global",
         "the global frame",
-        AT_5(observation="full", frame="global", steps=SHORT),
+        EARLIER(observation="full", frame="global", steps=SHORT),
         group="ablation: observation",
     ),
     Training(
         "short-errors",
         "`ppo-clip-5` in fewer steps",
-        AT_5(steps=SHORT),
+        EARLIER(steps=SHORT),
         group="ablation: observation",
     ),
     Training(
         "ppo-full",
-        "all that there is to see, cut at 5 standard deviations",
-        AT_5(observation="full"),
+        "`ppo-clip-5` that sees all there is",
+        EARLIER(observation="full", steps=LONG),
         seeds=(0, 1, 2, 3, 4),
         group="ablation: observation",
     ),
-    Training("ppo-clip-5", "observations cut at 5 standard deviations", AT_5(), group="ablation: observation"),
+    Training(
+        "ppo-narrow",
+        "tangents as activation, and a standard deviation that is learned",
+        TrainConfig(ppo=EARLIER_PPO, steps=LONG),
+        seeds=(0, 1, 2, 3),
+        group="ablation: network",
+    ),
+    Training(
+        "ppo-clip-5",
+        "`ppo-narrow` with observations cut at 5 standard deviations",
+        EARLIER(steps=LONG),
+        group="ablation: network",
+        compared_with=("ppo-velocity",),
+    ),
     Training(
         "short-one",
         "one scenario alone, `approach-30`, instead of the random family",
-        AT_5(observation="full", scenario="approach-30", steps=SHORT),
+        EARLIER(observation="full", scenario="approach-30", steps=SHORT),
         group="ablation: trajectories",
         compared_with=("short",),
     ),
     Training(
         "short-curriculum",
         "`short` that begins with robots 60 mm apart and more",
-        AT_5(observation="full", curriculum=60.0, steps=SHORT),
+        EARLIER(observation="full", curriculum=60.0, steps=SHORT),
         group="ablation: trajectories",
         compared_with=("short",),
     ),
     Training(
         "home-curriculum",
         "`home-short` that begins with robots 60 mm apart and more",
-        AT_5(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
+        EARLIER(action="home", ppo=HOME_PPO, curriculum=60.0, steps=HOME_SHORT),
         group="ablation: trajectories",
         compared_with=("home-short",),
     ),
     Training(
         "home-short",
         "`ppo-home` in fewer steps",
-        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
+        EARLIER(action="home", ppo=HOME_PPO, steps=HOME_SHORT),
         group="ablation: home",
         compared_with=("ppo-home",),
     ),
     Training(
         "home-level",
         "EPMs that stand on a level with the robots at home",
-        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=-0.593"),
+        EARLIER(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=-0.593"),
         group="ablation: home",
     ),
     Training(
         "home-upright",
         "EPMs that stand above and below the robots at home",
-        AT_5(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=0.977"),
+        EARLIER(action="home", ppo=HOME_PPO, steps=HOME_SHORT, plant="paper:home_turn_rad=0.977"),
         group="ablation: home",
     ),
     Training(
         "residual-three",
         "PPO that corrects `steered`",
-        AT_5(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
+        EARLIER(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
         group="three EPMs",
     ),
-    Training("ppo-three", "PPO as it comes", AT_5(observation="full", n_epm=3, steps=SHORT), group="three EPMs"),
+    Training("ppo-three", "PPO as it comes", EARLIER(observation="full", n_epm=3, steps=SHORT), group="three EPMs"),
     Training(
         "residual-10hz",
         "PPO that corrects `steered`",
-        AT_5(residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
+        EARLIER(residual="steered", residual_scale=0.2, steps=500_000, control_hz=10.0),
         group="10 Hz",
         scenarios=("approach-30", "approach-22.5", "approach-20"),
     ),
     Training(
         "arm-home",
         "PPO by offsets from the home configuration, trained on `arm`, where all parameters are drawn anew",
-        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
+        EARLIER(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm"),
         group="arms",
         scenarios=("approach-60", "approach-30"),
     ),
     Training(
         "arm-history",
         "`arm-home` that sees its last four observations",
-        AT_5(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm", history=4),
+        EARLIER(action="home", ppo=HOME_PPO, steps=3_000_000, plant="arm", history=4),
         group="arms",
         scenarios=("approach-60", "approach-30"),
     ),
