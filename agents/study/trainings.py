@@ -120,7 +120,7 @@ TRAININGS = (
         "`ppo-full` in fewer steps",
         EARLIER(observation="full", steps=SHORT),
         group="ablation: observation",
-        compared_with=("ppo-velocity",),
+        compared_with=("ppo-velocity", "ppo-clip-5"),
     ),
     Training(
         "short-global",
