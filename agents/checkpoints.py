@@ -29,6 +29,8 @@ from agents.store import (
 )
 from magenv.params import InputError, require
 
+_AVERAGES = {"step", "exp_avg", "exp_avg_sq"}
+"""What Adam keeps of each parameter, from its first step on."""
 _OPTIMISERS = {"ppo": ("policy.optimizer",), "sac": ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")}
 
 MODEL, BEST = "model", "best"
@@ -116,6 +118,9 @@ def _optimiser_state(optimiser: torch.optim.Optimizer, stored: dict[str, NDArray
             shape = parameters[int(part[1])].shape if part[2] != "step" else torch.Size()
             require(value.shape == shape, f"checkpoint's {key}", f"of shape {tuple(shape)}", tuple(value.shape))
             state.setdefault(int(part[1]), {})[part[2]] = torch.from_numpy(value)
+    learned = {number for number, parameter in enumerate(parameters) if parameter.requires_grad}
+    whole = set(state) in (set(), learned) and all(set(kept) == _AVERAGES for kept in state.values())
+    require(whole, "checkpoint", "with whole optimisers, of all that is learned", f"those of {len(state)} parameters")
     return {"state": state, "param_groups": groups}
 
 

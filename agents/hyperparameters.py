@@ -69,6 +69,8 @@ def search(config: TrainConfig) -> Path:
     """
     optuna = _optuna()
     Episodes(1, config.settings)
+    if config.correction is not None:
+        config.correction.base(config.settings)
     _shortened(config)
     folder, lock = new_folder(config.out, DEFAULT_FOLDER, _is_taken, "a folder without a search or a run")
     try:

@@ -202,16 +202,31 @@ def load_card(folder: Path) -> Card:
     told = 2 if here.startswith("0.") else 1  # before the first major version, minor ones may break
     same = isinstance(made, str) and made.split(".")[:told] == here.split(".")[:told]
     require(same, "model", f"of magenv {'.'.join(here.split('.')[:told])}, as this one", made)
-    own = card.config.get(card.algo)
-    trained = own.get("activation") if isinstance(own, dict) else None
-    require(
-        trained in (None, card.activation), "model's activation", f"{trained!r}, as in its training", card.activation
-    )
-    bound = dataclasses.asdict(card.settings) | {"history": card.history, "clip_observation": card.clip_observation}
-    for name, value in bound.items():  # a mode of the same size would go unnoticed
-        trained = card.config.get(name)
-        require(trained in (None, value), f"model's {name}", f"{trained!r}, as in its training", value)
+    _check_as_trained(card)
     return card
+
+
+def _check_as_trained(card: Card) -> None:
+    """Raise ``ValueError`` where a card tells of its training what it does not tell of the model.
+
+    What has the same size would go unnoticed: a mode, a share.
+    """
+    own: Any = card.config.get(card.algo)
+    require(isinstance(own, dict), "model's config", f"with the options of {card.algo}", own)
+    correction = card.residual
+    bound = dataclasses.asdict(card.settings) | {
+        "algo": card.algo,
+        "history": card.history,
+        "clip_observation": card.clip_observation,
+        "residual": None if correction is None else correction.controller,
+    }
+    if correction is not None:
+        bound["residual_scale"] = correction.scale
+    config = {"history": 1} | card.config  # there are models from before it could be more
+    for told, values in ((config, bound), (own, {"net": list(card.net), "activation": card.activation})):
+        for name, value in values.items():
+            trained = told.get(name)
+            require(trained == value, f"model's {name}", f"{trained!r}, as in its training", value)
 
 
 def load_policy(folder: Path) -> tuple[Arrays, Normalisation]:

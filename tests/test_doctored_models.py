@@ -18,6 +18,7 @@ import torch
 from messages import refusal
 from safetensors.torch import load_file, save_file
 
+import agents
 from agents.catalogue import controller
 from agents.checkpoints import stored_config
 from agents.learned import Learned
@@ -117,6 +118,13 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "clip infinite": lambda card: card.update(clip_observation=math.inf),
     "clip a text": lambda card: card.update(clip_observation="10"),
     "other clip": lambda card: card.update(clip_observation=5.0),
+    "no clip in its training": lambda card: card["config"].pop("clip_observation"),
+    "no activation in its training": lambda card: card["config"]["ppo"].pop("activation"),
+    "of another algorithm's training": lambda card: card["config"].update(algo="sac"),
+    "of no algorithm's training": lambda card: card["config"].pop("ppo"),
+    "options a list": lambda card: card["config"].update(ppo=[]),
+    "of another net's training": lambda card: card["config"]["ppo"].update(net=[64, 64]),
+    "of a residual's training": lambda card: card["config"].update(residual="idle"),
     "config a text": lambda card: card.update(config="none"),
     "other n_epm": lambda card: card["settings"].update(n_epm=3),
     "impossible n_epm": lambda card: card["settings"].update(n_epm=10**6),
@@ -153,6 +161,12 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
 def test_a_damaged_card_is_refused(checkpoint: Path, damage: str) -> None:
     changed(checkpoint, DAMAGED[damage])
     refusal(lambda: Learned(checkpoint))
+
+
+def test_a_residual_of_another_share_than_in_its_training_is_refused(tmp_path: Path) -> None:
+    shutil.copytree(Path(agents.__file__).parent / "data" / "steered-ppo", tmp_path / "model")
+    changed(tmp_path / "model", lambda card: card["residual"].update(scale=1.0))
+    assert "residual_scale must be 0.2, as in its training" in refusal(lambda: Learned(tmp_path / "model"))
 
 
 @pytest.mark.parametrize("text", ["[]", "null", '"magenv model 1"', "{}", "{" * 10_000, "[" * 100_000, "\x00", "NaN"])
@@ -206,7 +220,10 @@ def test_what_a_policy_is_stored_for_and_what_it_meets_are_both_named(checkpoint
         shutil.copytree(checkpoint, copy)
         changed(copy, DAMAGED[damage])
         if not training_told:
-            changed(copy, lambda card: card.update(config={}))
+            changed(copy, lambda card: card["config"].update(card["settings"]))
+            changed(copy, lambda card: card["config"]["ppo"].update(net=card["net"]))
+            if json.loads((copy / CARD).read_text())["residual"] is not None:
+                changed(copy, lambda card: card["config"].update(residual="idle", residual_scale=0.1))
         return refusal(lambda: Learned(copy))
 
     assert "'magenv model 1'; instead received 'magenv model 99'" in told("other format")
@@ -215,11 +232,11 @@ def test_what_a_policy_is_stored_for_and_what_it_meets_are_both_named(checkpoint
     assert "action must be 'home', as in its training; instead received 'pose'" in told("action of its size")
     assert "frame must be 'robots', as in its training; instead received 'global'" in told("frame of its size")
     assert "control_hz must be 2.0, as in its training; instead received 4.0" in told("other control_hz")
-    assert re.search(r"shape \(8, 63\).*\(16, 63\)", told("narrower net"))
+    assert re.search(r"shape \(8, 63\).*\(16, 63\)", told("narrower net", training_told=False))
     assert re.search(r"\[63, 6\].*'wrench'.*\[63, 10\]", told("other action", training_told=False))
     assert re.search(r"\[70, 15\].*n_epm 3.*\[63, 10\]", told("other n_epm", training_told=False))
     assert re.search(r"\[8, 10\].*'errors'.*\[63, 10\]", told("other observation", training_told=False))
-    assert re.search(r"\[73, 10\].*corrects idle.*\[63, 10\]", told("a policy of no residual"))
+    assert re.search(r"\[73, 10\].*corrects idle.*\[63, 10\]", told("a policy of no residual", training_told=False))
 
 
 def test_a_missing_model_is_refused(checkpoint: Path, tmp_path: Path) -> None:

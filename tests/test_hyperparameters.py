@@ -194,6 +194,8 @@ def test_without_optuna_it_is_told_how_to_install_it(make_config: MakeConfig, mo
 
 def test_an_unsound_configuration_is_refused_before_anything_is_written(make_config: MakeConfig) -> None:
     assert "scenario" in refusal(lambda: search(make_config(tune=True, scenario="nowhere")))
+    blind = make_config(tune=True, action=None, residual="predictive", observation="errors")
+    assert "observation must be 'full', as of predictive" in refusal(lambda: search(blind))
     assert not make_config().out.exists()
 
 
