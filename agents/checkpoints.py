@@ -166,7 +166,7 @@ def stored_config(run: Path) -> TrainConfig:
         raw["ppo"], raw["sac"] = (
             cls(**(raw[key] | {"net": tuple(raw[key]["net"])})) for key, cls in (("ppo", PPOConfig), ("sac", SACConfig))
         )
-        raw["cloning"] = CloningConfig(**raw.get("cloning", {}))  # runs begun before there was cloning go on
+        raw["cloning"] = CloningConfig(**raw["cloning"])
         return TrainConfig(**(raw | {"out": None, "resume": run}))
     except (KeyError, TypeError) as error:
         raise InputError(

@@ -28,7 +28,7 @@ from agents.evaluation import Score
 from agents.history import check_history
 from agents.residual import Correction
 from magenv.episodes import Settings
-from magenv.params import InputError, require
+from magenv.params import InputError, is_whole, require
 
 FORMAT = "magenv model 1"
 CARD, POLICY, TRAINING = "card.json", "policy.safetensors", "training.safetensors"
@@ -189,9 +189,9 @@ def load_card(folder: Path) -> Card:
     check_history(card.history)
     alone = card.residual is None
     require(alone or card.history == 1, "model's history", "1 where it corrects a controller", card.history)
+    require(is_whole(card.steps) and card.steps >= 0, "model's steps", "a whole number of at least 0", card.steps)
     for name, value, kind in (
         ("algo", card.algo, str),
-        ("steps", card.steps, int),
         ("config", card.config, dict),
         ("versions", card.versions, dict),
         ("command", card.command, str),

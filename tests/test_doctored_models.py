@@ -108,6 +108,7 @@ DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "net a number": lambda card: card.update(net=64),
     "a net of truths": lambda card: card.update(net=[True, True]),
     "fractional net": lambda card: card.update(net=[16.5, 8]),
+    "steps negative": lambda card: card.update(steps=-1),
     "steps a text": lambda card: card.update(steps="many"),
     "no activation": lambda card: card.pop("activation"),
     "foreign activation": lambda card: card.update(activation="elu"),

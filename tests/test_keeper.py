@@ -221,8 +221,7 @@ def test_an_optimiser_that_overflows_is_noticed_before_it_is_stored(
     assert steps_of(make_config().out) == [256, 384]
 
 
-@both
-@pytest.mark.parametrize("learning_rate", [1e3, 1e30])
+@pytest.mark.parametrize(("algo", "learning_rate"), [("ppo", 1e30), ("sac", 1e3), ("sac", 1e30)])
 def test_far_too_large_a_learning_rate_is_told(make_config: MakeConfig, algo: str, learning_rate: float) -> None:
     config = make_config(algo)
     own = dataclasses.replace(getattr(config, algo), learning_rate=learning_rate)

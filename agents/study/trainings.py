@@ -102,6 +102,7 @@ TRAININGS = (
         "absolute poses of the EPMs",
         EARLIER(action="pose", ppo=HOME_PPO, steps=3_000_000),
         group="ablation: action",
+        compared_with=("ppo-home", "ppo-full"),
     ),
     Training(
         "ppo-step",
@@ -143,7 +144,7 @@ TRAININGS = (
     ),
     Training(
         "ppo-narrow",
-        "tangents as activation, and a standard deviation that is learned",
+        "tangents as activation, a standard deviation that is learned, half as many steps again",
         TrainConfig(ppo=EARLIER_PPO, steps=LONG),
         seeds=(0, 1, 2, 3),
         group="ablation: network",
@@ -201,7 +202,9 @@ TRAININGS = (
         EARLIER(residual="steered", residual_scale=0.2, steps=500_000, n_epm=3),
         group="three EPMs",
     ),
-    Training("ppo-three", "PPO as it comes", EARLIER(observation="full", n_epm=3, steps=SHORT), group="three EPMs"),
+    Training(
+        "ppo-three", "`short` with three EPMs", EARLIER(observation="full", n_epm=3, steps=SHORT), group="three EPMs"
+    ),
     Training(
         "residual-10hz",
         "PPO that corrects `steered`",
