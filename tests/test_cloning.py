@@ -33,6 +33,7 @@ ROUND = 8 * 16
 TINY = dataclasses.replace(
     PPO_CONFIG,
     action=None,
+    observation="full",
     expert="steered",
     cloning=CloningConfig(rounds=3, steps=16, led=1, epochs=2),
     steps=4 * ROUND,
