@@ -31,7 +31,7 @@ _COLOURS = {
     "random": "#999999",
     "idle": "#CC79A7",
 }
-_OTHER_COLOURS = ("#000000", "#8C510A", "#7B3294")
+_OTHER_COLOURS = ("#000000", "#8C510A", "#7B3294", "#999933", "#CC6677", "#44AA99", "#555555")
 _INK = "#222222"
 _BAND = (10.0, 90.0)
 HOLDABLE_MM = {"parallel": 19.0, "antiparallel": 12.8}

@@ -30,6 +30,11 @@ def summary(name: str, scenario: str, episodes: int) -> Summary:
     [
         ("ppo", "approach-60", 0.5, 2),
         ("ppo", "approach-30", 1.2, 4),
+        ("ppo", "eight-30", 1.2, 4),
+        ("cloned-ppo", "approach-60", 0.25, 0.5),
+        ("cloned-ppo", "approach-30", 0.6, 1.5),
+        ("cloned-ppo", "eight-30", 0.6, 1.5),
+        ("full-ppo", "approach-22.5", 1.2, 4),
         ("home-ppo", "approach-60", 1.5, 16.7),
         ("home-ppo", "approach-30", 4, 30),
         ("steered-ppo", "approach-60", 0.25, 0.5),
