@@ -127,7 +127,7 @@ def _shortened(config: TrainConfig) -> TrainConfig:
 def _try(optuna: Any, study: optuna.Study, config: TrainConfig, folder: Path) -> Trial:
     """Train with the hyperparameters that the study asks for next, and tell it what they reach."""
     trial = study.ask()
-    own: Any = suggested(trial, config.ppo if config.algo == "ppo" else config.sac)
+    own: Any = suggested(trial, config.own)
     whole = dataclasses.replace(config, tune=False, trials=None, out=None, **{config.algo: own})
     out, scores = folder / f"trial-{trial.number:03d}", 0
     short = dataclasses.replace(_shortened(whole), out=out)

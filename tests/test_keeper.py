@@ -221,10 +221,20 @@ def test_an_optimiser_that_overflows_is_noticed_before_it_is_stored(
     assert steps_of(make_config().out) == [256, 384]
 
 
-@pytest.mark.parametrize(("algo", "learning_rate"), [("ppo", 1e30), ("sac", 1e3), ("sac", 1e30)])
-def test_far_too_large_a_learning_rate_is_told(make_config: MakeConfig, algo: str, learning_rate: float) -> None:
+@pytest.mark.parametrize(
+    ("algo", "learning_rate", "options"),
+    [
+        ("ppo", 1e3, {"learn_std": True, "activation": "tanh"}),  # else numbers stay finite
+        ("ppo", 1e30, {}),
+        ("sac", 1e3, {}),
+        ("sac", 1e30, {}),
+    ],
+)
+def test_far_too_large_a_learning_rate_is_told(
+    make_config: MakeConfig, algo: str, learning_rate: float, options: dict[str, Any]
+) -> None:
     config = make_config(algo)
-    own = dataclasses.replace(getattr(config, algo), learning_rate=learning_rate)
+    own = dataclasses.replace(config.own, learning_rate=learning_rate, **options)
     with pytest.raises(DivergedError, match=r"^The training diverged within \d+ steps .*lower learning rate"):
         train(dataclasses.replace(config, steps=2048, checkpoint_every=32, **{algo: own}))
     assert not (config.out / MODEL).exists()

@@ -259,7 +259,7 @@ def told_of(stored: Mapping[str, Any]) -> dict[str, Any]:
 def check_told(told: Mapping[str, Any], config: TrainConfig, where: str) -> None:
     """Raise ``InputError`` unless what is told of a configuration is this one.
 
-    What is not told counts as the default: options that came later than a record change nothing of it.
+    What is not told counts as the default: records need not tell options that came later and leave all as it was.
     """
     wanted = as_told(config)
     usual = as_told(TrainConfig(algo=config.algo))
