@@ -66,8 +66,9 @@ def _drive(model: Model, by: Floats, carried: bool, first: int, drive: Floats) -
         for i in range(COORDINATES):
             for k in range(n_epm):
                 for c in range(POSE_SIZE):
+                    first_a = 0 if c < 3 else 3  # of an EPM's centre, or moment
                     total = 0.0
-                    for a in range(EPM_SIZE):
+                    for a in range(first_a, first_a + 3):
                         total += model.gradients[i, EPM_SIZE * k + a] * by[old, k, a, c]
                     drive[i, at + POSE_SIZE * k + c] = total
 

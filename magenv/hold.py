@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magenv.angles import sincos, wrap
 from magenv.arithmetic import dot2
 from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
-from magenv.kernels import kernel, law, wide_vectors
+from magenv.kernels import in_cache_lines, kernel, law, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
     CONSTANTS,
@@ -193,7 +193,10 @@ def hold_rows(
     wide_vectors()
     n_epm, width, rough = len(magnets), len(side_by_side), len(rubbing) > 0
     late, travels = len(moving) >= LATE, len(moving) >= TRAVELLING
-    lanes, bodies = np.zeros((fields(n_epm, travels), width)), np.empty((2, STATE_SIZE))
+    lanes, bodies = in_cache_lines(fields(n_epm, travels), width), np.empty((2, STATE_SIZE))
+    for j in range(len(lanes)):
+        for i in range(width):
+            lanes[j, i] = 0.0
     rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
     h, upcoming, busy, idle = period / substeps, first, 0, True
     while True:

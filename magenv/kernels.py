@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -11,10 +13,14 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba import types
+from numba.core import cgutils, event
 from numba.extending import intrinsic
+from numba.np import arrayobj
+from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Number = TypeVar("Number", bool, int)
+Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 _CONSTANTS = ("params", "kernels", "lanes")
@@ -47,10 +53,38 @@ def _compile(function: Function, inlined: bool) -> Function:
     before = config.CACHE_DIR
     config.CACHE_DIR = _CACHE_DIR
     try:
-        compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=inlined)(function)
+        njit: Any = numba.njit
+        # Wrappers for callers in C, of which there are none, took a fifth of the time of compilation.
+        options = {"forceinline": inlined, "no_cfunc_wrapper": True}
+        compiled: Any = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
     finally:
         config.CACHE_DIR = before
     return cast("Function", compiled)
+
+
+class _Uncollected(event.Listener):
+    """Keeps Python from looking for garbage while numba compiles: that took a tenth of the time, and found little."""
+
+    def __init__(self) -> None:
+        self._lock, self._compiling, self._collected = threading.Lock(), 0, True
+
+    def on_start(self, event: Any) -> None:
+        """Begin to compile a function, perhaps for the sake of another."""
+        with self._lock:
+            if self._compiling == 0:
+                self._collected = gc.isenabled()
+                gc.disable()
+            self._compiling += 1
+
+    def on_end(self, event: Any) -> None:
+        """End it."""
+        with self._lock:
+            self._compiling -= 1
+            if self._compiling == 0 and self._collected:
+                gc.enable()
+
+
+event.register("numba:compile", _Uncollected())  # type: ignore[no-untyped-call]
 
 
 def kernel(function: Function) -> Function:
@@ -90,3 +124,70 @@ wide_vectors = cast("Callable[[], None]", intrinsic(_wide_vectors))
 
 By default it takes 256 bits at most, for the sake of programs in which few vectors stand among other work.
 """
+
+
+_CACHE_LINE = 64
+
+
+def _in_cache_lines(typing_context: Any, rows: Any, columns: Any) -> Any:
+    array_type = types.Array(types.float64, 2, "C")
+    arrays, pack = cast("Any", arrayobj), cast("Any", cgutils).pack_array
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        rows, columns = arguments
+        item = context.get_constant(types.intp, 8)
+        pitch = builder.mul(columns, item)
+        align = context.get_constant(types.uint32, _CACHE_LINE)
+        meminfo = context.nrt.meminfo_alloc_aligned(builder, builder.mul(rows, pitch), align)
+        array = arrays.make_array(array_type)(context, builder)
+        arrays.populate_array(
+            array,
+            data=builder.bitcast(context.nrt.meminfo_data(builder, meminfo), array.data.type),
+            shape=pack(builder, (rows, columns)),
+            strides=pack(builder, (pitch, item)),
+            itemsize=item,
+            meminfo=meminfo,
+        )
+        return array._getvalue()
+
+    return array_type(types.intp, types.intp), generate
+
+
+in_cache_lines = cast("Callable[[int, int], NDArray[np.float64]]", intrinsic(_in_cache_lines))
+"""Return a new array of rows that begin where cache lines do, if they are whole ones long; its numbers are not set.
+
+Numpy's begin anywhere: the hold, whose vectors are a cache line, was up to a tenth slower or not from one run to the
+next.
+"""
+
+
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return an array without its owner, a tuple with all its arrays so, anything else as it is."""
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = array.meminfo.type(None)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        kinds: Any = kind
+        parts = [_without_owner(context, builder, k, builder.extract_value(value, i)) for i, k in enumerate(kinds)]
+        return context.make_tuple(builder, kind, parts)
+    return value
+
+
+def _uncounted(typing_context: Any, arrays: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _without_owner(context, builder, arrays, arguments[0])
+
+    return arrays(arrays), generate
+
+
+uncounted = cast("Callable[[Arrays], Arrays]", intrinsic(_uncounted))
+"""Return a tuple, its arrays without owners: counting references to them took a fifth of a short step.
+
+Whoever calls this keeps the arrays alive; a kernel by ``keep``, after all that is done with them.
+"""
+
+
+@law
+def keep(arrays: Any) -> None:
+    """Do nothing: what is used here is kept until then."""

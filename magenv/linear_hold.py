@@ -1,6 +1,8 @@
-"""A hold by its linear motion: M q'' + D q' = F + K q about where the robots are, of constant wrench F and stiffness K.
+"""Holds by their linear motion: M q'' + D q' = F + K q about where robots are, of constant wrench F and stiffness K.
 
-Some microseconds, where integrating the plant takes a hundred; and how much small deviations grow in it.
+Some microseconds, where integrating the plant takes a hundred; and how much small deviations grow in it. Holds under
+poses that differ a little are foreseen side by side, one a column of ``lanes`` (``HOLD_SIZE``, width): see
+``magenv.lanes`` for why. Loops over ``ALONE`` or ``BESIDE`` are of constant length, which is what vectorises them.
 """
 
 from __future__ import annotations
@@ -11,14 +13,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magenv.kernels import kernel
+from magenv.kernels import kernel, law
 from magenv.params import Body
 from magenv.sensitivity import COORDINATES
 
 Floats = NDArray[np.float64]
 
+ALONE, BESIDE = (0,), (0,) * 16
+"""Of these lengths are the rows of lanes: one hold, or as many as the poses of three EPMs have numbers, and one."""
 _SUBSTEP_S = 0.01
 """Decay by drag is exact in each."""
+_TERMS = 6
+"""Of the exponential's series, for a norm of half at most."""
+_MOST_HALVINGS = 60
+
+# The wrench (N, N m) and its stiffness (N and N m per m and rad, row by row); how far robots come (m, rad) and their
+# rates then; the logarithm of what deviations grow by.
+FORCE, STIFFNESS, MOVED, RATES, GROWN = 0, 6, 42, 48, 54
+# Room for the growth: stiffness over drag (1/s), its exponential over a part of the period and the product of two
+# matrices; norms, a row's sum, parts of the period and how often these were halved.
+SCALED, _EXPONENTIAL, _PRODUCT, _NORM, _SUM, _PART, _HALVINGS = 55, 91, 127, 163, 164, 165, 166
+HOLD_SIZE = 167
 
 
 class LinearHold(NamedTuple):
@@ -44,78 +59,166 @@ class LinearHold(NamedTuple):
         return cls(drag, np.exp(-drag * substep / inertia), 1.0 / np.sqrt(drag), substep, substeps)
 
 
+Six = tuple[float, float, float, float, float, float]
+
+
+@law
+def _six(lanes: Floats, w: int, v: int, first: int, apart: int) -> Six:
+    """Return six fields of lane ``v``, so far apart."""
+    a, b, c = lanes[w * first + v], lanes[w * (first + apart) + v], lanes[w * (first + 2 * apart) + v]
+    return (
+        a,
+        b,
+        c,
+        lanes[w * (first + 3 * apart) + v],
+        lanes[w * (first + 4 * apart) + v],
+        lanes[w * (first + 5 * apart) + v],
+    )
+
+
+@law
+def _halves(a: Six, b: Six) -> tuple[float, float]:
+    """Return the halves of a product of two rows."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2], a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+
+
+@law
+def _drift(lanes: Floats, w: int, v: int, i: int, half: float) -> float:
+    moved: float = lanes[w * (MOVED + i) + v] + half * lanes[w * (RATES + i) + v]
+    lanes[w * (MOVED + i) + v] = moved
+    return moved
+
+
+@law
+def _kick(lanes: Floats, w: int, v: int, i: int, x: Six, decay: float, gain: float) -> None:
+    one, other = _halves(_six(lanes, w, v, STIFFNESS + COORDINATES * i, 1), x)
+    lanes[w * (RATES + i) + v] = decay * lanes[w * (RATES + i) + v] + gain * (lanes[w * (FORCE + i) + v] + one + other)
+
+
+@law
+def _drift_all(lanes: Floats, w: int, v: int, half: float) -> Six:
+    x, y, heading = _drift(lanes, w, v, 0, half), _drift(lanes, w, v, 1, half), _drift(lanes, w, v, 2, half)
+    return x, y, heading, _drift(lanes, w, v, 3, half), _drift(lanes, w, v, 4, half), _drift(lanes, w, v, 5, half)
+
+
 @kernel
-def _multiply(a: Floats, b: Floats, out: Floats) -> None:
+def foresee(hold: LinearHold, substeps: int, rates: Floats, lanes: Floats, side_by_side: tuple[int, ...]) -> None:
+    """Write how far robots of these ``rates`` (6,) come in so many substeps, and their rates then."""
+    half, w = 0.5 * hold.substep, len(side_by_side)
+    # Along x and y, and for both robots, the same.
+    (decay, turn_decay), (drag, turn_drag) = (hold.decay[0], hold.decay[2]), (hold.drag[0], hold.drag[2])
+    gain, turn_gain = (1.0 - decay) / drag, (1.0 - turn_decay) / turn_drag
     for i in range(COORDINATES):
-        a0, a1, a2, a3, a4, a5 = a[i, 0], a[i, 1], a[i, 2], a[i, 3], a[i, 4], a[i, 5]
-        for j in range(COORDINATES):  # written out, so that it is vectorised
-            first, second = a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j], a3 * b[3, j] + a4 * b[4, j] + a5 * b[5, j]
-            out[i, j] = first + second
+        for v in range(w):
+            lanes[w * (MOVED + i) + v], lanes[w * (RATES + i) + v] = 0.0, rates[i]
+    for _ in range(substeps):
+        for v in range(w):  # written out: loops within would be in the way of vectors
+            x = _drift_all(lanes, w, v, half)
+            _kick(lanes, w, v, 0, x, decay, gain)
+            _kick(lanes, w, v, 1, x, decay, gain)
+            _kick(lanes, w, v, 2, x, turn_decay, turn_gain)
+            _kick(lanes, w, v, 3, x, decay, gain)
+            _kick(lanes, w, v, 4, x, decay, gain)
+            _kick(lanes, w, v, 5, x, turn_decay, turn_gain)
+            _drift_all(lanes, w, v, half)
+
+
+@law
+def _element(lanes: Floats, w: int, v: int, b: int, at: int, row: Six, j: int) -> None:
+    one, other = _halves(row, _six(lanes, w, v, b + j, COORDINATES))
+    lanes[w * (at + j) + v] = one + other
+
+
+@law
+def _product_row(lanes: Floats, w: int, v: int, a: int, b: int, i: int) -> None:
+    row, at = _six(lanes, w, v, a + COORDINATES * i, 1), _PRODUCT + COORDINATES * i
+    _element(lanes, w, v, b, at, row, 0)
+    _element(lanes, w, v, b, at, row, 1)
+    _element(lanes, w, v, b, at, row, 2)
+    _element(lanes, w, v, b, at, row, 3)
+    _element(lanes, w, v, b, at, row, 4)
+    _element(lanes, w, v, b, at, row, 5)
+
+
+@law
+def _multiply(lanes: Floats, a: int, b: int, side_by_side: tuple[int, ...]) -> None:
+    """Write the product of two matrices, whose fields begin at ``a`` and ``b``."""
+    w = len(side_by_side)
+    for v in range(w):
+        _product_row(lanes, w, v, a, b, 0)
+        _product_row(lanes, w, v, a, b, 1)
+        _product_row(lanes, w, v, a, b, 2)
+        _product_row(lanes, w, v, a, b, 3)
+        _product_row(lanes, w, v, a, b, 4)
+        _product_row(lanes, w, v, a, b, 5)
 
 
 @kernel
-def log_growth(a: Floats, period: float, exponential: Floats, scratch: Floats) -> float:
-    """Return the logarithm of the norm of exp(a period), for a symmetric ``a`` (6, 6) in 1/s; both others are written.
+def log_growth(period: float, lanes: Floats, side_by_side: tuple[int, ...]) -> None:
+    """Write the logarithms of the norms of exp(a period), of the symmetric matrices ``SCALED``, a, in 1/s.
 
     By its Taylor series over a small part of the period, and squaring.
     """
-    norm = 0.0
+    w, most = len(side_by_side), 0.0
+    for v in range(w):
+        lanes[w * _NORM + v] = 0.0
     for i in range(COORDINATES):
-        row = 0.0
+        for v in range(w):
+            lanes[w * _SUM + v] = 0.0
         for j in range(COORDINATES):
-            row += abs(a[i, j])
-        norm = max(norm, row)
-    halvings, part = 0, period
-    while norm * part > 0.5 and halvings < 60:
-        part *= 0.5
-        halvings += 1
-    exponential[:] = 0.0
-    for order in range(6, 0, -1):
+            for v in range(w):
+                lanes[w * _SUM + v] += abs(lanes[w * (SCALED + COORDINATES * i + j) + v])
+        for v in range(w):
+            lanes[w * _NORM + v] = max(lanes[w * _NORM + v], lanes[w * _SUM + v])
+    for v in range(w):
+        part, halvings = period, 0
+        while lanes[w * _NORM + v] * part > 0.5 and halvings < _MOST_HALVINGS:
+            part *= 0.5
+            halvings += 1
+        lanes[w * _PART + v], lanes[w * _HALVINGS + v] = part, halvings
+        most = max(most, lanes[w * _HALVINGS + v])
+    for i in range(COORDINATES * COORDINATES):
+        for v in range(w):
+            lanes[w * (_EXPONENTIAL + i) + v] = 0.0
+    for order in range(_TERMS, 0, -1):
         for i in range(COORDINATES):
-            exponential[i, i] += 1.0
-        _multiply(a, exponential, scratch)
-        for i in range(COORDINATES):
-            for j in range(COORDINATES):
-                exponential[i, j] = part / order * scratch[i, j]
+            for v in range(w):
+                lanes[w * (_EXPONENTIAL + (COORDINATES + 1) * i) + v] += 1.0
+        _multiply(lanes, SCALED, _EXPONENTIAL, side_by_side)
+        for v in range(w):
+            lanes[w * _SUM + v] = lanes[w * _PART + v] / order
+        for i in range(COORDINATES * COORDINATES):
+            for v in range(w):
+                lanes[w * (_EXPONENTIAL + i) + v] = lanes[w * _SUM + v] * lanes[w * (_PRODUCT + i) + v]
     for i in range(COORDINATES):
-        exponential[i, i] += 1.0
-    for _ in range(halvings):
-        _multiply(exponential, exponential, scratch)
-        exponential[:] = scratch
-    square = 0.0
-    for i in range(COORDINATES):
-        for j in range(COORDINATES):
-            square += exponential[i, j] ** 2
-    return 0.5 * math.log(square)
+        for v in range(w):
+            lanes[w * (_EXPONENTIAL + (COORDINATES + 1) * i) + v] += 1.0
+    for turn in range(int(most)):
+        _multiply(lanes, _EXPONENTIAL, _EXPONENTIAL, side_by_side)
+        for i in range(COORDINATES * COORDINATES):
+            for v in range(w):
+                squares = turn < lanes[w * _HALVINGS + v]
+                old, new = lanes[w * (_EXPONENTIAL + i) + v], lanes[w * (_PRODUCT + i) + v]
+                lanes[w * (_EXPONENTIAL + i) + v] = new if squares else old
+    for v in range(w):
+        lanes[w * _SUM + v] = 0.0
+    for i in range(COORDINATES * COORDINATES):
+        for v in range(w):
+            lanes[w * _SUM + v] += lanes[w * (_EXPONENTIAL + i) + v] * lanes[w * (_EXPONENTIAL + i) + v]
+    for v in range(w):
+        lanes[w * GROWN + v] = 0.5 * math.log(lanes[w * _SUM + v])
 
 
 @kernel
-def foresee(hold: LinearHold, substeps: int, force: Floats, k: Floats, rates: Floats, x: Floats, v: Floats) -> None:
-    """Write how far the robots come in so many substeps, ``x`` (6,), and their rates then, ``v`` (6,).
+def growth(hold: LinearHold, lanes: Floats, side_by_side: tuple[int, ...]) -> None:
+    """Write the logarithms of the norms of exp(D^-1/2 K D^-1/2 T): how deviations of robots without inertia grow.
 
-    Of ``rates`` (6,) at first, ``force`` (6,) N and N m, and stiffness ``k`` (6, 6), N and N m per m and rad.
+    Stiffnesses K are symmetric.
     """
-    half = 0.5 * hold.substep
-    for i in range(COORDINATES):
-        x[i], v[i] = 0.0, rates[i]
-    for _ in range(substeps):
-        for i in range(COORDINATES):
-            x[i] += half * v[i]
-        for i in range(COORDINATES):
-            first = k[i, 0] * x[0] + k[i, 1] * x[1] + k[i, 2] * x[2]
-            second = k[i, 3] * x[3] + k[i, 4] * x[4] + k[i, 5] * x[5]
-            v[i] = hold.decay[i] * v[i] + (1.0 - hold.decay[i]) / hold.drag[i] * (force[i] + first + second)
-        for i in range(COORDINATES):
-            x[i] += half * v[i]
-
-
-@kernel
-def growth(hold: LinearHold, k: Floats, scaled: Floats, exponential: Floats, scratch: Floats) -> float:
-    """Return the logarithm of the norm of exp(D^-1/2 K D^-1/2 T): how deviations of robots without inertia grow.
-
-    ``k`` (6, 6) is symmetric; the other matrices are room to compute in.
-    """
+    w = len(side_by_side)
     for i in range(COORDINATES):
         for j in range(COORDINATES):
-            scaled[i, j] = hold.root[i] * k[i, j] * hold.root[j]
-    return log_growth(scaled, hold.substep * hold.substeps, exponential, scratch)
+            for v in range(w):
+                at = COORDINATES * i + j
+                lanes[w * (SCALED + at) + v] = hold.root[i] * lanes[w * (STIFFNESS + at) + v] * hold.root[j]
+    log_growth(hold.substep * hold.substeps, lanes, side_by_side)

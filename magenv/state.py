@@ -11,10 +11,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numba import types
 from numba.experimental import structref
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from magenv.kernels import kernel
+from magenv.kernels import kernel, uncounted
 from magenv.magnets import Size
 from magenv.steering_cost import Steering
 from magenv.streams import Keys
@@ -151,32 +150,9 @@ class _Packed(structref.StructRefProxy):
 structref.define_proxy(_Packed, _PackedType, State._fields)  # type: ignore[no-untyped-call]
 
 
-def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """Return an array without its owner, a tuple with all its arrays so, anything else as it is."""
-    if isinstance(kind, types.Array):
-        array = context.make_array(kind)(context, builder, value)
-        array.meminfo = array.meminfo.type(None)
-        return array._getvalue()
-    if isinstance(kind, types.BaseTuple):
-        kinds: Any = kind
-        parts = [_without_owner(context, builder, k, builder.extract_value(value, i)) for i, k in enumerate(kinds)]
-        return context.make_tuple(builder, kind, parts)
-    return value
-
-
-@intrinsic
-def _uncounted(_: Any, state: Any) -> Any:
-    """Return the tuple, its arrays without owners: counting references to them took a fifth of a short step."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _without_owner(context, builder, state, arguments[0])
-
-    return state(state), generate
-
-
 @kernel
 def _pack(state: State) -> _Packed:
-    return _Packed(*_uncounted(state))  # type: ignore[no-untyped-call, call-arg]
+    return _Packed(*uncounted(state))  # type: ignore[no-untyped-call]
 
 
 def packed(state: State) -> State:

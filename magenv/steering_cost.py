@@ -12,13 +12,13 @@ from magenv.angles import sincos
 from magenv.calm_holds import CalmHolds
 from magenv.forecast import STATE, Course, Goal
 from magenv.kernels import kernel
-from magenv.linear_hold import LinearHold, foresee, growth
+from magenv.linear_hold import ALONE, BESIDE, FORCE, GROWN, HOLD_SIZE, MOVED, STIFFNESS, LinearHold, foresee, growth
 from magenv.local import local_basis, shift
 from magenv.magnets import robots_wrench
 from magenv.params import Plant, System
 from magenv.poses import EPM_SIZE, HOME_RADIUS_M, POSE_SIZE
 from magenv.sensitivity import COORDINATES, Model, place
-from magenv.stiffness import planar_kernel
+from magenv.stiffness import add_epm, planar_kernel, write_mutual
 
 Floats = NDArray[np.float64]
 
@@ -70,21 +70,22 @@ class Workspace(NamedTuple):
     """Where they should be at the end of what is looked at."""
     course: Course
     """EPMs that stand still."""
-    force: Floats
-    """(6,) wrench on the robots, N and N m."""
     stiffness: Floats
-    """(6, 6) of it, N and N m per m and rad."""
-    moved: Floats
-    """(6,) how far they come by the linear motion; so are the rates."""
-    rates: Floats
+    """(6, 6) of the wrench on the robots, N and N m per m and rad."""
+    first: Floats
+    """(N, 6, 6) of what acts before an EPM in the order in which all are summed up: robots, and EPMs before it."""
+    parts: Floats
+    """(N, 6, 6) of each EPM alone."""
+    hold: Floats
+    """(h,) lane of a hold by its linear motion."""
+    holds: Floats
+    """(16 h,) lanes of holds under EPMs moved a little."""
     landed: Floats
     """(12,) state by the motion itself."""
-    scaled: Floats
-    """(6, 6) room for ``growth``, as the next two."""
-    exponential: Floats
-    product: Floats
     trial: Floats
     """(N, 6) EPMs."""
+    trials: Floats
+    """(5 N, N, 6)"""
     bases: Floats
     """(N, 6, 5)"""
     residuals: Floats
@@ -134,15 +135,14 @@ def workspace(s: Steering) -> Workspace:
         np.empty(c),
         Goal(np.full(1, s.substeps), np.zeros((1, 1, STATE)), weights, np.zeros((1, n, EPM_SIZE)), 0.0, 0.0),
         course,
-        np.empty(c),
         np.empty((c, c)),
-        np.empty(c),
-        np.empty(c),
+        np.empty((n, c, c)),
+        np.empty((n, c, c)),
+        np.zeros(HOLD_SIZE * len(ALONE)),
+        np.zeros(HOLD_SIZE * len(BESIDE)),
         np.empty(STATE),
-        np.empty((c, c)),
-        np.empty((c, c)),
-        np.empty((c, c)),
         np.empty((n, EPM_SIZE)),
+        np.empty((u, n, EPM_SIZE)),
         np.zeros((n, EPM_SIZE, POSE_SIZE)),
         np.empty(rows),
         np.empty(rows),
@@ -185,21 +185,27 @@ def look(s: Steering, w: Workspace, state: Floats, grown: float) -> int:
 
 
 @kernel
-def weigh(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats, out: Floats) -> float:
-    """Write the residuals (r,) of EPMs (N, 6) by the linear motion; return their squared sum."""
-    model, n = w.model, len(epms)
+def _put(w: Workspace, state: Floats, epms: Floats, lanes: Floats, v: int) -> None:
+    """Write the wrench of EPMs (N, 6) on the robots, and its stiffness, which is known, into lane ``v``."""
+    model, width = w.model, len(lanes) // HOLD_SIZE
     place(model, epms)
-    force = robots_wrench(model.lane, 0, n, None, state[0], state[1], state[2], state[3], state[4], state[5])
+    force = robots_wrench(model.lane, 0, len(epms), None, state[0], state[1], state[2], state[3], state[4], state[5])
     for i in range(COORDINATES):
-        w.force[i] = force[i]
-    planar_kernel(w.positions, w.moments, epms, model.epm_moment, False, w.stiffness, model.gradients)
-    foresee(s.hold, substeps, w.force, w.stiffness, state[COORDINATES:], w.moved, w.rates)
+        lanes[width * (FORCE + i) + v] = force[i]
+        for j in range(COORDINATES):
+            lanes[width * (STIFFNESS + COORDINATES * i + j) + v] = w.stiffness[i, j]
+
+
+@kernel
+def _judge(w: Workspace, state: Floats, epms: Floats, lanes: Floats, v: int, out: Floats) -> float:
+    """Write the residuals (r,) of EPMs (N, 6) whose hold is foreseen in lane ``v``; return their squared sum."""
+    model, n, width = w.model, len(epms), len(lanes) // HOLD_SIZE
     for i in range(COORDINATES):
-        out[i] = w.goal.weights[i] * (state[i] + w.moved[i] - w.goal.references[0, 0, i])
-    out[COORDINATES] = max(growth(s.hold, w.stiffness, w.scaled, w.exponential, w.product), 0.0) / GROWTH
+        out[i] = w.goal.weights[i] * (state[i] + lanes[width * (MOVED + i) + v] - w.goal.references[0, 0, i])
+    out[COORDINATES] = max(lanes[width * GROWN + v], 0.0) / GROWTH
     for robot in range(2):
         turn = 3 * robot + 2
-        field = -w.stiffness[turn, turn] / model.nominal[n + robot]
+        field = -lanes[width * (STIFFNESS + (COORDINATES + 1) * turn) + v] / model.nominal[n + robot]
         out[COORDINATES + 1 + robot] = (field - _FIELD_T) / _FIELD_SPREAD_T
     for k in range(n):
         x, y, z = epms[k, 0], epms[k, 1], epms[k, 2]
@@ -211,32 +217,68 @@ def weigh(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats,
 
 
 @kernel
+def weigh(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats, out: Floats) -> float:
+    """Write the residuals (r,) of EPMs (N, 6) by the linear motion; return their squared sum."""
+    planar_kernel(w.positions, w.moments, epms, w.model.epm_moment, False, w.stiffness, w.model.gradients)
+    _put(w, state, epms, w.hold, 0)
+    foresee(s.hold, substeps, state[COORDINATES:], w.hold, ALONE)
+    growth(s.hold, w.hold, ALONE)
+    return _judge(w, state, epms, w.hold, 0, out)
+
+
+@kernel
 def normal_equations(w: Workspace, residuals: Floats, slopes: Floats) -> None:
     """Write those of residuals (r,) and their slopes (r, 5 N)."""
-    for p in range(len(w.downhill)):
-        total = 0.0
-        for i in range(len(residuals)):
-            total -= slopes[i, p] * residuals[i]
-        w.downhill[p] = total
-        for q in range(p + 1):
-            total = 0.0
-            for i in range(len(residuals)):
-                total += slopes[i, p] * slopes[i, q]
-            w.normal[p, q] = total
+    w.downhill[:] = 0.0
+    w.normal[:] = 0.0
+    for i in range(len(residuals)):
+        for p in range(len(w.downhill)):
+            w.downhill[p] -= slopes[i, p] * residuals[i]
+            for q in range(p + 1):  # innermost: no sum, so that it is vectorised
+                w.normal[p, q] += slopes[i, p] * slopes[i, q]
+
+
+@kernel
+def _stiffen(w: Workspace, epms: Floats, k: int) -> None:
+    """Write the stiffness of EPMs (N, 6) of which ``k`` alone is not where those are whose ``parts`` are known."""
+    for i in range(COORDINATES):
+        for j in range(COORDINATES):
+            w.stiffness[i, j] = w.first[k, i, j]
+    add_epm(w.positions, w.moments, epms, w.model.epm_moment, k, False, w.stiffness, w.model.gradients)
+    for other in range(k + 1, len(epms)):
+        for i in range(COORDINATES):
+            for j in range(COORDINATES):
+                w.stiffness[i, j] += w.parts[other, i, j]
 
 
 @kernel
 def differentiate_cost(s: Steering, w: Workspace, state: Floats, substeps: int, epms: Floats) -> None:
     """Write the slopes of the residuals by the EPMs' local coordinates, and the normal equations."""
     step = np.zeros(POSE_SIZE)
+    write_mutual(w.positions, w.moments, w.first[0])
+    for k in range(len(epms)):
+        w.parts[k] = 0.0
+        add_epm(w.positions, w.moments, epms, w.model.epm_moment, k, False, w.parts[k], w.model.gradients)
+        if k + 1 < len(epms):
+            for i in range(COORDINATES):
+                for j in range(COORDINATES):
+                    w.first[k + 1, i, j] = w.first[k, i, j] + w.parts[k, i, j]
     for k in range(len(epms)):
         local_basis(epms[k], w.bases[k])
         for c in range(POSE_SIZE):
-            w.trial[:] = epms
+            at = POSE_SIZE * k + c
+            for other in range(len(epms)):
+                for a in range(EPM_SIZE):
+                    w.trials[at, other, a] = epms[other, a]
             step[:] = 0.0
             step[c] = _DIFFERENCE
-            shift(w.trial[k], w.bases[k], step, 0.0, math.inf)
-            weigh(s, w, state, substeps, w.trial, w.others)
-            for i in range(len(w.residuals)):
-                w.jacobian[i, POSE_SIZE * k + c] = (w.others[i] - w.residuals[i]) / _DIFFERENCE
+            shift(w.trials[at, k], w.bases[k], step, 0.0, math.inf)
+            _stiffen(w, w.trials[at], k)
+            _put(w, state, w.trials[at], w.holds, at)
+    foresee(s.hold, substeps, state[COORDINATES:], w.holds, BESIDE)
+    growth(s.hold, w.holds, BESIDE)
+    for at in range(len(w.trials)):
+        _judge(w, state, w.trials[at], w.holds, at, w.others)
+        for i in range(len(w.residuals)):
+            w.jacobian[i, at] = (w.others[i] - w.residuals[i]) / _DIFFERENCE
     normal_equations(w, w.residuals, w.jacobian)

@@ -17,6 +17,7 @@ from magenv.dynamics import Physics
 from magenv.hold import hold_rows, hold_shape
 from magenv.home import home_rows, start_rows
 from magenv.kernels import kernel, typed
+from magenv.magnets import copy_epms
 from magenv.reach import make_allowed
 from magenv.sensitivity import COORDINATES
 from magenv.starts import place_rows
@@ -189,7 +190,7 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
         epms, held = s.epms, s.held_epms
         for i in range(first, last):
             if mask[i]:
-                epms[i] = held[min(i, len(held) - 1)]
+                copy_epms(held, min(i, len(held) - 1), epms, i)
     begin_rows(
         first,
         last,
@@ -208,10 +209,11 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
     for i in range(first, last):
         projected[i] &= not mask[i]
         if mask[i]:
-            targets[i] = present[i]  # what is held until something else is commanded
+            copy_epms(present, i, targets, i)  # what is held until something else is commanded
         if mask[i] and s.uncertain:
-            add_noise(measured, i, s.plant_key[i], 0, s.noise_position, s.noise_heading, stream)
-            before[i] = measured[i]
+            add_noise(measured, i, s.plant_key[i], _ONLY[0], s.noise_position, s.noise_heading, stream)
+            for j in range(6):
+                before[i, j // 3, j % 3] = measured[i, j // 3, j % 3]
     expected = s.expected
     for i in range(first, last):
         if mask[i]:
@@ -249,55 +251,6 @@ def _settle_rows(first: int, last: int, active: Bools, s: State) -> None:
             ended[1, i] = over and not ended[0, i]
 
 
-@kernel
-def _hold(
-    first: int,
-    last: int,
-    active: Bools,
-    s: State,
-    observations: Observations,
-    magnets: tuple[int, ...],
-    side_by_side: tuple[int, ...],
-    moving: tuple[int, ...],
-    rubbing: tuple[int, ...],
-) -> None:
-    """Hold the commanded EPMs for one control period; what that paid, and what is told of all rows."""
-    hold_rows(
-        first,
-        last,
-        active,
-        s.robots,
-        s.epms,
-        s.targets,
-        s.constants,
-        s.mass,
-        s.epm_moment,
-        s.epm_size,
-        s.coefficients,
-        s.duration,
-        s.step,
-        s.numbers,
-        s.counts,
-        s.period,
-        s.substeps,
-        s.loss_distance,
-        s.tracking_distance,
-        s.diameter,
-        s.wall_radius,
-        s.motion,
-        s.routes,
-        s.queue,
-        s.slow,
-        s.rubs,
-        magnets,
-        side_by_side,
-        moving,
-        rubbing,
-    )
-    _settle_rows(first, last, active, s)
-    tell_rows(first, last, s.every, s, observations)
-
-
 @functools.cache
 def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool) -> Step:
     """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
@@ -320,7 +273,37 @@ def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: boo
             _velocity(first, last, active, actions, s)
         else:
             _wrench(first, last, active, actions, s)
-        _hold(first, last, active, s, observations, *shape)
+        hold_rows(
+            first,
+            last,
+            active,
+            s.robots,
+            s.epms,
+            s.targets,
+            s.constants,
+            s.mass,
+            s.epm_moment,
+            s.epm_size,
+            s.coefficients,
+            s.duration,
+            s.step,
+            s.numbers,
+            s.counts,
+            s.period,
+            s.substeps,
+            s.loss_distance,
+            s.tracking_distance,
+            s.diameter,
+            s.wall_radius,
+            s.motion,
+            s.routes,
+            s.queue,
+            s.slow,
+            s.rubs,
+            *shape,
+        )
+        _settle_rows(first, last, active, s)
+        tell_rows(first, last, s.every, s, observations)
 
     return kernel(step_episodes)
 
@@ -330,22 +313,12 @@ def one_kernel(
     mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool
 ) -> Callable[[State], tuple[object, ...]]:
     """Return the kernel that steps the only episode by ``action``, clipped; one that is not finite moves nothing."""
-    shape = hold_shape(n_epm, width, moves, rough)
+    step = step_kernel(mode, n_epm, width, moves, rough)
 
     def step_one(s: State) -> tuple[object, ...]:
         fit = clip(s.action[0])
         if fit:
-            if mode == "home":
-                _home(*_ONLY, s.every, s.action, s)
-            elif mode == "pose":
-                _pose(*_ONLY, s.every, s.action, s)
-            elif mode == "step":
-                _step(*_ONLY, s.every, s.action, s)
-            elif mode == "velocity":
-                _velocity(*_ONLY, s.every, s.action, s)
-            else:
-                _wrench(*_ONLY, s.every, s.action, s)
-            _hold(*_ONLY, s.every, s, s.observation, *shape)
+            step(*_ONLY, s.every, s.action, s, s.observation)
         paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
         return (
             fit,

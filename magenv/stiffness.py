@@ -79,6 +79,41 @@ def _write_gradients(out: Floats, robot: int, k: int, n: Vector, r: Vector, mome
 
 
 @kernel
+def write_mutual(positions: Floats, moments: Floats, stiffness: Floats) -> None:
+    """Write what the robots alone make of the stiffness; arguments as of ``planar_kernel``."""
+    stiffness[:] = 0.0
+    for robot in range(2):
+        p, m = positions[robot], moments[robot]
+        q, other = positions[1 - robot], moments[1 - robot]
+        n, s = (m[0], m[1], m[2]), (other[0], other[1], other[2])
+        r = (p[0] - q[0], p[1] - q[1], p[2] - q[2])
+        _add_source(stiffness, robot, n, s, r)
+        _add_mutual(stiffness, robot, n, s, r)
+
+
+@kernel
+def add_epm(
+    positions: Floats,
+    moments: Floats,
+    epms: Floats,
+    epm_moments: Floats,
+    k: int,
+    by_epms: bool,
+    stiffness: Floats,
+    gradients: Floats,
+) -> None:
+    """Add what EPM ``k`` makes of the stiffness; arguments as of ``planar_kernel``."""
+    e, moment = epms[k], epm_moments[k]
+    s = (moment * e[3], moment * e[4], moment * e[5])
+    for robot in range(2):
+        p, m = positions[robot], moments[robot]
+        n, r = (m[0], m[1], m[2]), (p[0] - e[0], p[1] - e[1], p[2] - e[2])
+        by = _add_source(stiffness, robot, n, s, r)
+        if by_epms:
+            _write_gradients(gradients, robot, k, n, r, moment, by)
+
+
+@kernel
 def planar_kernel(
     positions: Floats,
     moments: Floats,
@@ -103,21 +138,9 @@ def planar_kernel(
     gradients : ndarray, shape (6, 6 N)
         Per m of the centre and per unit of the unit moment, written where ``by_epms``.
     """
-    stiffness[:] = 0.0
-    for robot in range(2):
-        p, m = positions[robot], moments[robot]
-        q, other = positions[1 - robot], moments[1 - robot]
-        n, s = (m[0], m[1], m[2]), (other[0], other[1], other[2])
-        r = (p[0] - q[0], p[1] - q[1], p[2] - q[2])
-        _add_source(stiffness, robot, n, s, r)
-        _add_mutual(stiffness, robot, n, s, r)
-        for k in range(len(epms)):
-            e, moment = epms[k], epm_moments[k]
-            s = (moment * e[3], moment * e[4], moment * e[5])
-            r = (p[0] - e[0], p[1] - e[1], p[2] - e[2])
-            by = _add_source(stiffness, robot, n, s, r)
-            if by_epms:
-                _write_gradients(gradients, robot, k, n, r, moment, by)
+    write_mutual(positions, moments, stiffness)
+    for k in range(len(epms)):
+        add_epm(positions, moments, epms, epm_moments, k, by_epms, stiffness, gradients)
 
 
 def planar_stiffness(positions: ArrayLike, moments: ArrayLike, pose: ArrayLike, epm_moment_am2: float) -> Floats:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import sincos, wrap
 from magenv.forecast import STATE
-from magenv.kernels import kernel
+from magenv.kernels import keep, kernel, uncounted
 from magenv.outcome import CONVERGED, FELL_BACK, NOT_CONVERGED
 from magenv.poses import robots_frame
 from magenv.sensitivity import COORDINATES
@@ -48,7 +48,8 @@ def velocity_rows(
     ``outcome.OUTCOMES``. Where nothing can be foreseen, ``targets`` stay: the last command.
     """
     state, ahead = np.empty(STATE), np.empty(COORDINATES)
-    room = workspace(steering)
+    own = workspace(steering)
+    room = uncounted(own)
     found = np.empty(epms.shape[1:])
     for i in range(first, last):
         if not active[i]:
@@ -73,3 +74,4 @@ def velocity_rows(
             expected[i, :COORDINATES], expected[i, COORDINATES:] = state[:COORDINATES], 0.0
         else:
             targets[i], expected[i] = found, room.landed
+    keep(own)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import platform
 import re
 import subprocess
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from magenv.allocation import allocate, allocate_batch
 from magenv.env import TwoRobots
 from magenv.hold import hold_rows, hold_shape
+from magenv.kernels import in_cache_lines
 from magenv.params import PLANTS, System, TaskParams
 from magenv.solver import best_of, descend
 from magenv.trajectories import shaped
@@ -188,6 +190,34 @@ def test_the_hold_allocates_before_its_loops_and_calls_nothing_within(compiled: 
     assert all(name.startswith(("NRT_", "llvm.")) or contact.fullmatch(name) for name in calls)
     assert not re.search(r"llvm\.(sin|cos|exp|log|pow)", " ".join(calls))
     assert sum("alloc" in name.lower() for name in calls) <= 4
+
+
+def test_the_lanes_begin_with_a_cache_line() -> None:
+    @numba.njit
+    def beginnings(rows: int, times: int) -> list[int]:
+        arrays = [in_cache_lines(rows, 16) for _ in range(times)]
+        for array in arrays:
+            array[:] = 1.0
+        return [array.ctypes.data for array in arrays]
+
+    assert not any(at % 64 for rows in (1, 7, 78) for at in beginnings(rows, 10))
+
+
+@pytest.mark.parametrize("collected", [True, False])
+def test_garbage_is_collected_after_compilation_as_before(collected: bool) -> None:
+    seen: list[bool] = []
+    before = gc.isenabled()
+    (gc.enable if collected else gc.disable)()
+    try:
+        inner = numba.njit(lambda x: 2.0 * x)
+        numba.njit(lambda x: inner(x))(1.0)  # one within the other
+        seen.append(gc.isenabled())
+        with pytest.raises(numba.core.errors.TypingError):
+            numba.njit(lambda x: inner(x) + "")(1.0)
+        seen.append(gc.isenabled())
+    finally:
+        (gc.enable if before else gc.disable)()
+    assert seen == [collected, collected]
 
 
 # Threads

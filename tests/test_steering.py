@@ -13,11 +13,27 @@ from agents.steered import Steered
 from magenv.actions import Actions
 from magenv.episodes import Episodes, Settings
 from magenv.forecast import STATE
-from magenv.linear_hold import LinearHold, foresee, growth, log_growth
+from magenv.linear_hold import (
+    ALONE,
+    BESIDE,
+    FORCE,
+    GROWN,
+    HOLD_SIZE,
+    MOVED,
+    RATES,
+    SCALED,
+    STIFFNESS,
+    LinearHold,
+    foresee,
+    growth,
+    log_growth,
+)
+from magenv.local import shift
 from magenv.outcome import CONVERGED, FELL_BACK
 from magenv.params import Body, Plant, System
-from magenv.poses import from_cartesian, robots_frame
+from magenv.poses import POSE_SIZE, from_cartesian, robots_frame
 from magenv.sensitivity import COORDINATES
+from magenv.steering_cost import Steering, differentiate_cost, locate, look, weigh, workspace
 from magenv.stiffness import planar_stiffness
 from magenv.velocity import VELOCITY_MPS, VELOCITY_RADPS
 
@@ -44,13 +60,76 @@ def turned(points: Floats, angle: float) -> Floats:
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-@pytest.mark.parametrize("size", [1e-3, 1.0, 60.0])
-def test_growth_is_the_norm_of_the_exponential(rng: np.random.Generator, size: float) -> None:
-    a = rng.normal(size=(COORDINATES, COORDINATES)) * size
-    a = 0.5 * (a + a.T)
-    scratch = np.empty((2, COORDINATES, COORDINATES))
-    grown = log_growth(a, PERIOD_S, scratch[0], scratch[1])
-    assert grown == pytest.approx(math.log(np.linalg.norm(expm(a * PERIOD_S))), rel=1e-6, abs=1e-6)
+WIDTHS = (ALONE, BESIDE)
+
+
+def lanes_of(side_by_side: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Lanes of holds, as kernels and as tests see them."""
+    lanes = np.zeros((HOLD_SIZE, len(side_by_side)))
+    return lanes.reshape(-1), lanes
+
+
+def symmetric(rng: np.random.Generator, n: int) -> Floats:
+    a = rng.normal(size=(n, COORDINATES, COORDINATES))
+    return np.asarray(0.5 * (a + a.swapaxes(1, 2)))
+
+
+@pytest.mark.parametrize("side_by_side", WIDTHS)
+def test_growth_is_the_norm_of_the_exponential(rng: np.random.Generator, side_by_side: tuple[int, ...]) -> None:
+    """Of small and of great matrices side by side, which take none and many squarings."""
+    for size in (1e-3, 1.0, 60.0):
+        flat, lanes = lanes_of(side_by_side)
+        sizes = size * 10.0 ** rng.uniform(-1.0, 0.0, lanes.shape[1])
+        a = symmetric(rng, lanes.shape[1]) * sizes[:, None, None]
+        lanes[SCALED : SCALED + 36] = a.reshape(-1, 36).T
+        log_growth(PERIOD_S, flat, side_by_side)
+        exact = [math.log(np.linalg.norm(expm(matrix * PERIOD_S))) for matrix in a]
+        np.testing.assert_allclose(lanes[GROWN], exact, rtol=1e-6, atol=1e-6)
+
+
+def test_holds_side_by_side_are_those_alone_bit_for_bit(rng: np.random.Generator) -> None:
+    """A matrix that is nothing, one that is not finite and ones that grow differently change nothing beside them."""
+    hold, rates = LinearHold.of(Plant().body, PERIOD_S), rng.normal(size=COORDINATES) * 0.01
+    flat, lanes = lanes_of(BESIDE)
+    lanes[FORCE : FORCE + COORDINATES] = rng.normal(size=(COORDINATES, 16)) * 1e-3
+    stiffness = symmetric(rng, 16) / hold.root / hold.root[:, None] * 10.0 ** rng.uniform(-2.0, 1.5, (16, 1, 1))
+    stiffness[3], stiffness[5, 1, 2] = 0.0, math.nan
+    lanes[STIFFNESS : STIFFNESS + 36] = stiffness.reshape(16, 36).T
+    given = lanes.copy()
+    foresee(hold, hold.substeps, rates, flat, BESIDE)
+    growth(hold, flat, BESIDE)
+    for v in range(16):
+        own, alone = lanes_of(ALONE)
+        alone[:, 0] = given[:, v]
+        foresee(hold, hold.substeps, rates, own, ALONE)
+        growth(hold, own, ALONE)
+        written = slice(MOVED, GROWN + 1)
+        assert alone[written, 0].tobytes() == np.ascontiguousarray(lanes[written, v]).tobytes()
+    assert np.isnan(lanes[GROWN, 5])
+    assert np.isfinite(np.delete(lanes[GROWN], 5)).all()
+
+
+@pytest.mark.parametrize("n_epm", [2, 3])
+def test_slopes_side_by_side_are_those_of_one_after_the_other(rng: np.random.Generator, n_epm: int) -> None:
+    """Bit for bit: what one EPM moved a little changes is put together with what the others do as it is for all."""
+    system = System(n_epm=n_epm)
+    steering = Steering.of(system, Plant(), PERIOD_S)
+    w, (robots,) = workspace(steering), apart(rng, 1, 0.04)
+    state = np.concatenate([robots.reshape(-1), rng.normal(size=COORDINATES) * 0.01])
+    epms = Actions("velocity", system).home(robots[None])[0]
+    locate(w, state, rng.normal(size=COORDINATES) * 0.003)
+    substeps = look(steering, w, state, 0.0)
+    weigh(steering, w, state, substeps, epms, w.residuals)
+    differentiate_cost(steering, w, state, substeps, epms)
+    slopes, normal, beside = w.jacobian.copy(), w.normal.copy(), np.empty_like(w.residuals)
+    for at in range(POSE_SIZE * n_epm):
+        moved, step = epms.copy(), np.zeros(POSE_SIZE)
+        step[at % POSE_SIZE] = 1e-6
+        shift(moved[at // POSE_SIZE], w.bases[at // POSE_SIZE], step, 0.0, math.inf)
+        weigh(steering, w, state, substeps, moved, beside)
+        assert (slopes[:, at] == (beside - w.residuals) / 1e-6).all()
+    np.testing.assert_allclose(np.tril(normal), np.tril(slopes.T @ slopes), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(w.downhill, -slopes.T @ w.residuals, rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1, 0.5, 2.0])
@@ -61,7 +140,9 @@ def test_what_is_foreseen_solves_the_equation_of_motion(rng: np.random.Generator
     inertia = np.tile([body.mass_kg, body.mass_kg, body.inertia_kgm2], 2)
     half = 0.5 * rng.normal(size=(COORDINATES, COORDINATES)) / hold.root / hold.root[:, None]  # a few per second
     stiffness, force = half + half.T, rng.normal(size=COORDINATES) * hold.drag * 0.01
-    moved, then = np.empty((2, COORDINATES))
+    flat, lanes = lanes_of(ALONE)
+    lanes[FORCE : FORCE + COORDINATES, 0], lanes[STIFFNESS : STIFFNESS + 36, 0] = force, stiffness.reshape(-1)
+    moved, then = lanes[MOVED : MOVED + COORDINATES, 0], lanes[RATES : RATES + COORDINATES, 0]
     for rates in (np.zeros(COORDINATES), rng.normal(size=COORDINATES) * 0.01):
         motion = np.zeros((13, 13))
         motion[:6, 6:12] = np.eye(6)
@@ -69,7 +150,7 @@ def test_what_is_foreseen_solves_the_equation_of_motion(rng: np.random.Generator
         motion[6:12, 6:12] = np.diag(-hold.drag / inertia)
         motion[6:12, 12] = force / inertia
         exact = expm(motion * period) @ np.concatenate([np.zeros(6), rates, [1.0]])
-        foresee(hold, hold.substeps, force, stiffness, rates, moved, then)
+        foresee(hold, hold.substeps, rates, flat, ALONE)
         np.testing.assert_allclose(moved, exact[:6], rtol=0.03, atol=0.05 * np.abs(exact[:6]).max())
         np.testing.assert_allclose(then, exact[6:12], rtol=0.05, atol=0.02 * np.abs(exact[6:12]).max())
 
@@ -118,8 +199,7 @@ def test_a_hold_is_sought_in_which_errors_grow_little(rng: np.random.Generator) 
     actions = Actions("velocity", system)
     epms, _ = actions.to_epms(np.zeros((32, COORDINATES)), robots, actions.home(robots))
     hold = LinearHold.of(Plant().body, PERIOD_S)
-    room = np.empty((3, COORDINATES, COORDINATES))
-
+    flat, lanes = lanes_of(ALONE)
     grown = []
     for robot, epm in zip(robots, epms, strict=True):
         positions = np.concatenate([robot[:, :2], np.zeros((2, 1))], axis=1)
@@ -128,7 +208,9 @@ def test_a_hold_is_sought_in_which_errors_grow_little(rng: np.random.Generator) 
         pose = from_cartesian(epm[:, :3], epm[:, 3:])
         k = planar_stiffness(positions, system.ipm_moment_am2 * moments, pose, system.epm_moment_am2)
         grown.append(np.linalg.norm(expm(k * hold.root * hold.root[:, None] * PERIOD_S)))
-        assert growth(hold, k, *room) == pytest.approx(math.log(grown[-1]), rel=1e-6)
+        lanes[STIFFNESS : STIFFNESS + 36, 0] = k.reshape(-1)
+        growth(hold, flat, ALONE)
+        assert lanes[GROWN, 0] == pytest.approx(math.log(grown[-1]), rel=1e-6)
     assert np.median(grown) < 3.0
 
 
