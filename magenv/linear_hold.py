@@ -1,8 +1,8 @@
 """Holds by their linear motion: M q'' + D q' = F + K q about where robots are, of constant wrench F and stiffness K.
 
 Some microseconds, where integrating the plant takes a hundred; and how much small deviations grow in it. Holds under
-poses that differ a little are foreseen side by side, one a column of ``lanes`` (``HOLD_SIZE``, width): see
-``magenv.lanes`` for why. Loops over ``ALONE`` or ``BESIDE`` are of constant length, which is what vectorises them.
+poses that differ a little are foreseen side by side, one a lane (see ``magenv.lanes``): field f of lane v of w stands
+at w f + v, with w of ``ALONE`` or ``BESIDE``, so that fields stand apart by constants and the loops are vectorised.
 """
 
 from __future__ import annotations
