@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.floor import Kernels, nothing, products
+from benchmarks.floor import Holds, Kernels, nothing, products
 from benchmarks.measure import EXTRA, Contestant, Effort, Times, installed, on_cores, side_by_side, tell
 from benchmarks.peak import gain_of_two, multiply_adds
 from benchmarks.policies import POLICIES, Policy, Script, make_batch, script
@@ -38,6 +38,7 @@ CASES = {
 SUBSTEPS = 50
 """Of ``BASE``."""
 PEAK = "peak of one core"
+HOLD = "a hold alone"
 EPISODE = 400
 """Steps of an episode under control at 4 Hz: the record of one is played again and again."""
 HELD = {"N = 3, 4 Hz, approach-60", MOVING}
@@ -124,6 +125,7 @@ def _batches(effort: Effort) -> Iterator[Line]:
             resets, substeps = batch.observed()
             notes[name] = f"per step {resets:.2g} resets, {substeps:.3g} substeps"
     contestants |= dict(_vector_peers(effort)) | {PEAK: multiply_adds(1)}
+    contestants[HOLD] = Holds(CASES[BASE], effort.envs, effort.steps).contestant()
     times = side_by_side(contestants, effort.repeats)
     for policy in POLICIES:
         yield from _against_peers(times, policy, notes[_name(BASE, policy)])
@@ -163,11 +165,16 @@ def _against_peers(times: Times, policy: Policy, note: str) -> Iterator[Row]:
 
 
 def _bounds(times: Times) -> Iterator[Row]:
-    """How fast a step would be that had nothing but the products of its hold, at the peak measured beside it."""
+    """How fast a step would be that had nothing but its hold, or its products at the peak measured beside it."""
     each = products(CASES[BASE])
     flops = 2.0 * each * SUBSTEPS  # that of a product and a sum
     for peer in ("EnvPool CartPole, same envs", "HalfCheetah-v5"):
         if peer in times.of:
+            ratio, note = (
+                times.speedup(HOLD, peer),
+                f"{SUBSTEPS} substeps; no command, observation, reward, info, reset",
+            )
+            yield Row(f"{HOLD}, {BASE}", times.rate(HOLD), "steps/s", peer, times.rate(peer), ratio, note=note)
             bound, ratio = times.rate(PEAK) / flops, times.speedup(PEAK, peer) / flops
             note = f"{each} a substep, {SUBSTEPS} substeps, at the peak of multiply-adds; no other work at all"
             yield Row(f"products of a hold alone, {BASE}", bound, "steps/s", peer, times.rate(peer), ratio, note=note)

@@ -1,4 +1,4 @@
-"""What steps cannot go below: an environment that does nothing, the laws without Python, the products of a hold."""
+"""What steps cannot go below: an environment that does nothing, the laws without Python, a hold alone, its products."""
 
 from __future__ import annotations
 
@@ -87,6 +87,30 @@ class Kernels:
     def contestant(self) -> Contestant:
         """Return this loop as a contestant."""
         return Contestant(self.run, len(self._actions), self.reset)
+
+
+class Holds:
+    """Holds of many episodes, each from the start and all its substeps long, and nothing else of a step."""
+
+    def __init__(self, settings: Settings, envs: int, steps: int) -> None:
+        episodes, self._every, self._steps = Episodes(envs, settings), np.ones(envs, np.bool_), steps
+        for row in range(envs):
+            episodes.seed(row, seeding.np_random(row)[0])
+        episodes.start(self._every)
+        self.world = episodes.world
+        self._robots, self._epms = self.world.robots.copy(), self.world.epms.copy()
+        self._epms[..., :3] *= 2.0  # too far away to move robots out of control in one hold
+
+    def run(self) -> None:
+        """Hold, with the robots put back before each."""
+        for _ in range(self._steps):
+            self.world.robots[...] = self._robots
+            self.world.step_count[...] = 0
+            self.world.step(self._epms, self._every)
+
+    def contestant(self) -> Contestant:
+        """Return these holds as a contestant."""
+        return Contestant(self.run, len(self._every) * self._steps)
 
 
 _PRODUCT = re.compile(r"^\s+v(?:fn?m(?:add|sub)\d+|mul)pd\b", re.M)

@@ -107,6 +107,15 @@ def test_kernels_without_python_play_what_the_env_plays() -> None:
         np.testing.assert_array_equal(played.episodes.state.robots[0], info["robots"])
 
 
+def test_holds_alone_are_whole() -> None:
+    holds = floor.Holds(env.CASES[env.BASE], 8, 3)
+    for _ in range(2):
+        holds.run()
+        counts = holds.world.measurements.counts
+        assert (counts[0] == env.SUBSTEPS).all()
+        assert (counts[1] == 0).all(), "control is kept"
+
+
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
 def test_products_of_a_substep_are_counted() -> None:
     """Five dipoles of about thirty, two pairs of sine and cosine, six cubics; not those of single lanes."""
