@@ -104,9 +104,10 @@ def _collection(
         for env in envs.values():
             env.close()
     took, free = (1e6 * n * times.seconds(name) for name in ("ours", "an env for nothing"))
-    note = (
-        f"per step {collectors['ours'].resets_per_step():.2g} resets; a step of all envs takes {took:.0f} µs, without"
-        f" an env {free:.0f} µs: 0.85 x leaves the env {free / 0.85 - free:.0f} µs"
+    resets = collectors["ours"].resets_per_step()
+    note = f"per step {resets:.2g} resets; a step of all envs takes {took:.0f} µs, without an env {free:.0f} µs"
+    note += (
+        f": 0.85 x leaves the env {free / 0.85 - free:.0f} µs" if limited else "; each of ours seeks the EPMs' poses"
     )
     what = f"PPO.collect_rollouts, {n} envs, {policy}"
     for peer, limit in (("DummyVecEnv", 1.8), ("an env for nothing", 0.85)):

@@ -43,7 +43,9 @@ class Course(NamedTuple):
     path: Floats
     """(rows, N, 6) EPMs that act."""
     by: Floats
-    """(rows, 2, N, 6, 5) derivatives by the command before and by this one, in their local coordinates."""
+    """(rows, 2, N, 6, 5) derivatives by the command before and by this one, in their local coordinates.
+
+    Of centres by the first three alone, of moments by the last two."""
     carried: bool
     """Whether the EPMs travel, and so depend on the command before."""
 

@@ -6,6 +6,7 @@ import gc
 import hashlib
 import os
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -59,31 +60,48 @@ def _compile(function: Function, inlined: bool) -> Function:
         compiled: Any = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
     finally:
         config.CACHE_DIR = before
+    _OURS.add(compiled)
     return cast("Function", compiled)
 
 
 class _Uncollected(event.Listener):
-    """Keeps Python from looking for garbage while numba compiles: that took a tenth of the time, and found little."""
+    """Keeps Python from looking for garbage while our kernels compile: that took a tenth of the time, and found little.
+
+    What others compile is left alone. Who disables collection himself meanwhile, in another thread, finds it enabled.
+    """
 
     def __init__(self) -> None:
+        self._begin()
+        os.register_at_fork(after_in_child=self._after_fork)
+
+    def _begin(self) -> None:
         self._lock, self._compiling, self._collected = threading.Lock(), 0, True
+
+    def _after_fork(self) -> None:
+        """Forget what another thread was compiling: it is not in the child."""
+        if self._compiling > 0 and self._collected:
+            gc.enable()
+        self._begin()
 
     def on_start(self, event: Any) -> None:
         """Begin to compile a function, perhaps for the sake of another."""
-        with self._lock:
-            if self._compiling == 0:
-                self._collected = gc.isenabled()
-                gc.disable()
-            self._compiling += 1
+        if event.data["dispatcher"] in _OURS:
+            with self._lock:
+                if self._compiling == 0:
+                    self._collected = gc.isenabled()
+                    gc.disable()
+                self._compiling += 1
 
     def on_end(self, event: Any) -> None:
         """End it."""
-        with self._lock:
-            self._compiling -= 1
-            if self._compiling == 0 and self._collected:
-                gc.enable()
+        if event.data["dispatcher"] in _OURS:
+            with self._lock:
+                self._compiling -= 1
+                if self._compiling == 0 and self._collected:
+                    gc.enable()
 
 
+_OURS: weakref.WeakSet[Any] = weakref.WeakSet()
 event.register("numba:compile", _Uncollected())  # type: ignore[no-untyped-call]
 
 
@@ -92,7 +110,8 @@ def kernel(function: Function) -> Function:
 
     ``error_model="numpy"``: a division by zero gives infinity or NaN, as in numpy, instead of an exception. No fast
     mathematics, contraction of products and sums included: NaN and infinity stay visible, and scalar and batched calls
-    give the same bits. Kernels release the interpreter lock, so that threads may share a batch.
+    give the same bits. What a kernel closes over must not be a kernel: numba would find it on disk never again. Kernels
+    release the interpreter lock, so that threads may share a batch.
     """
     return _compile(function, inlined=False)
 

@@ -37,7 +37,7 @@ HOLD_SIZE = 167
 
 
 class LinearHold(NamedTuple):
-    """What is known of a hold beforehand."""
+    """What is known of a hold beforehand, of robots that are alike and move along x as along y."""
 
     drag: Floats
     """(6,) N s/m and N m s/rad, of x, y, heading of both robots."""
@@ -105,7 +105,6 @@ def _drift_all(lanes: Floats, w: int, v: int, half: float) -> Six:
 def foresee(hold: LinearHold, substeps: int, rates: Floats, lanes: Floats, side_by_side: tuple[int, ...]) -> None:
     """Write how far robots of these ``rates`` (6,) come in so many substeps, and their rates then."""
     half, w = 0.5 * hold.substep, len(side_by_side)
-    # Along x and y, and for both robots, the same.
     (decay, turn_decay), (drag, turn_drag) = (hold.decay[0], hold.decay[2]), (hold.drag[0], hold.drag[2])
     gain, turn_gain = (1.0 - decay) / drag, (1.0 - turn_decay) / turn_drag
     for i in range(COORDINATES):

@@ -15,7 +15,7 @@ from magenv.kernels import kernel
 from magenv.linear_hold import ALONE, BESIDE, FORCE, GROWN, HOLD_SIZE, MOVED, STIFFNESS, LinearHold, foresee, growth
 from magenv.local import local_basis, shift
 from magenv.magnets import robots_wrench
-from magenv.params import Plant, System
+from magenv.params import Plant, System, require
 from magenv.poses import EPM_SIZE, HOME_RADIUS_M, POSE_SIZE
 from magenv.sensitivity import COORDINATES, Model, place
 from magenv.stiffness import add_epm, planar_kernel, write_mutual
@@ -50,7 +50,15 @@ class Steering(NamedTuple):
 
     @classmethod
     def of(cls, system: System, plant: Plant, period_s: float, calm: CalmHolds | None = None) -> Steering:
-        """Return the steering on a nominal plant, with holds of ``period_s`` (s); ``calm`` is by default the table."""
+        """Return the steering on a nominal plant, with holds of ``period_s`` (s); ``calm`` is by default the table.
+
+        Raises
+        ------
+        ValueError
+            If there are more EPMs than have room beside each other in ``linear_hold``.
+        """
+        most = len(BESIDE) // POSE_SIZE
+        require(system.n_epm <= most, "n_epm", f"at most {most} to steer by", system.n_epm)
         substeps = plant.substeps(period_s)
         model = Model.of(system, plant, period_s / substeps)
         calm = CalmHolds.load(system.n_epm) if calm is None else calm

@@ -251,6 +251,55 @@ def _settle_rows(first: int, last: int, active: Bools, s: State) -> None:
             ended[1, i] = over and not ended[0, i]
 
 
+@kernel
+def _hold(
+    first: int,
+    last: int,
+    active: Bools,
+    s: State,
+    observations: Observations,
+    magnets: tuple[int, ...],
+    side_by_side: tuple[int, ...],
+    moving: tuple[int, ...],
+    rubbing: tuple[int, ...],
+) -> None:
+    """Hold the commanded EPMs for one control period; what that paid, and what is told of all rows."""
+    hold_rows(
+        first,
+        last,
+        active,
+        s.robots,
+        s.epms,
+        s.targets,
+        s.constants,
+        s.mass,
+        s.epm_moment,
+        s.epm_size,
+        s.coefficients,
+        s.duration,
+        s.step,
+        s.numbers,
+        s.counts,
+        s.period,
+        s.substeps,
+        s.loss_distance,
+        s.tracking_distance,
+        s.diameter,
+        s.wall_radius,
+        s.motion,
+        s.routes,
+        s.queue,
+        s.slow,
+        s.rubs,
+        magnets,
+        side_by_side,
+        moving,
+        rubbing,
+    )
+    _settle_rows(first, last, active, s)
+    tell_rows(first, last, s.every, s, observations)
+
+
 @functools.cache
 def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool) -> Step:
     """Return the kernel that steps episodes by ``actions`` (n, size) within [-1, 1].
@@ -273,37 +322,7 @@ def step_kernel(mode: ActionMode, n_epm: int, width: int, moves: int, rough: boo
             _velocity(first, last, active, actions, s)
         else:
             _wrench(first, last, active, actions, s)
-        hold_rows(
-            first,
-            last,
-            active,
-            s.robots,
-            s.epms,
-            s.targets,
-            s.constants,
-            s.mass,
-            s.epm_moment,
-            s.epm_size,
-            s.coefficients,
-            s.duration,
-            s.step,
-            s.numbers,
-            s.counts,
-            s.period,
-            s.substeps,
-            s.loss_distance,
-            s.tracking_distance,
-            s.diameter,
-            s.wall_radius,
-            s.motion,
-            s.routes,
-            s.queue,
-            s.slow,
-            s.rubs,
-            *shape,
-        )
-        _settle_rows(first, last, active, s)
-        tell_rows(first, last, s.every, s, observations)
+        _hold(first, last, active, s, observations, *shape)
 
     return kernel(step_episodes)
 
@@ -313,12 +332,22 @@ def one_kernel(
     mode: ActionMode, n_epm: int, width: int, moves: int, rough: bool
 ) -> Callable[[State], tuple[object, ...]]:
     """Return the kernel that steps the only episode by ``action``, clipped; one that is not finite moves nothing."""
-    step = step_kernel(mode, n_epm, width, moves, rough)
+    shape = hold_shape(n_epm, width, moves, rough)
 
     def step_one(s: State) -> tuple[object, ...]:
         fit = clip(s.action[0])
         if fit:
-            step(*_ONLY, s.every, s.action, s, s.observation)
+            if mode == "home":
+                _home(*_ONLY, s.every, s.action, s)
+            elif mode == "pose":
+                _pose(*_ONLY, s.every, s.action, s)
+            elif mode == "step":
+                _step(*_ONLY, s.every, s.action, s)
+            elif mode == "velocity":
+                _velocity(*_ONLY, s.every, s.action, s)
+            else:
+                _wrench(*_ONLY, s.every, s.action, s)
+            _hold(*_ONLY, s.every, s, s.observation, *shape)
         paid, ended, numbers, counts = s.paid, s.ended, s.numbers, s.counts
         return (
             fit,

@@ -7,20 +7,25 @@ import platform
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding
 import numba
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.extending import overload
 from numpy.typing import NDArray
 
+from magenv import kernels
 from magenv.allocation import allocate, allocate_batch
 from magenv.env import TwoRobots
 from magenv.hold import hold_rows, hold_shape
 from magenv.kernels import in_cache_lines
 from magenv.params import PLANTS, System, TaskParams
 from magenv.solver import best_of, descend
+from magenv.steps import one_kernel, step_kernel
 from magenv.trajectories import shaped
 from magenv.vector_env import TwoRobotsVector
 from magenv.workers import Workers
@@ -203,21 +208,46 @@ def test_the_lanes_begin_with_a_cache_line() -> None:
     assert not any(at % 64 for rows in (1, 7, 78) for at in beginnings(rows, 10))
 
 
+@pytest.mark.parametrize("make", [step_kernel, one_kernel])
+def test_kernels_close_over_no_kernel(make: Any) -> None:
+    """Numba's key of what is on disk would be another in every process."""
+    made = make("home", *World(1, System(), PLANTS["paper"], TaskParams()).shape)
+    assert made.py_func.__closure__
+    assert not any(isinstance(cell.cell_contents, Dispatcher) for cell in made.py_func.__closure__)
+
+
 @pytest.mark.parametrize("collected", [True, False])
 def test_garbage_is_collected_after_compilation_as_before(collected: bool) -> None:
     seen: list[bool] = []
+
+    def watched(law: Callable[[float], float]) -> Any:
+        """A kernel, not kept on disk, that looks on while it is compiled."""
+
+        def within(x: float) -> float:
+            return x
+
+        @overload(within)
+        def looking_on(x):  # type: ignore[no-untyped-def]  # numba wants the signature of what is returned
+            seen.append(gc.isenabled())
+            return law
+
+        compiled = numba.njit(lambda x: within(x))
+        kernels._OURS.add(compiled)
+        return compiled
+
     before = gc.isenabled()
     (gc.enable if collected else gc.disable)()
     try:
-        inner = numba.njit(lambda x: 2.0 * x)
-        numba.njit(lambda x: inner(x))(1.0)  # one within the other
+        assert watched(lambda x: 2.0 * x)(1.0) == 2.0
         seen.append(gc.isenabled())
         with pytest.raises(numba.core.errors.TypingError):
-            numba.njit(lambda x: inner(x) + "")(1.0)
+            watched(lambda x: x + "")(1.0)  # type: ignore[operator, return-value]
         seen.append(gc.isenabled())
     finally:
         (gc.enable if before else gc.disable)()
-    assert seen == [collected, collected]
+    assert not seen[0]
+    assert not any(seen[2:-1])
+    assert seen[1] == seen[-1] == collected
 
 
 # Threads

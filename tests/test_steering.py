@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from agents.steered import Steered
 from magenv.actions import Actions
+from magenv.calm_holds import CalmHolds
 from magenv.episodes import Episodes, Settings
 from magenv.forecast import STATE
 from magenv.linear_hold import (
@@ -130,6 +131,12 @@ def test_slopes_side_by_side_are_those_of_one_after_the_other(rng: np.random.Gen
         assert (slopes[:, at] == (beside - w.residuals) / 1e-6).all()
     np.testing.assert_allclose(np.tril(normal), np.tril(slopes.T @ slopes), rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(w.downhill, -slopes.T @ w.residuals, rtol=1e-12, atol=1e-9)
+
+
+def test_more_epms_than_there_is_room_for_are_refused() -> None:
+    none = CalmHolds(np.zeros((1, 3)), np.zeros((1, 4, 6)))
+    with pytest.raises(ValueError, match=r"Input n_epm must be at most 3 to steer by; instead received 4"):
+        Steering.of(System(n_epm=4), Plant(), PERIOD_S, none)
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1, 0.5, 2.0])
