@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magenv.angles import sincos, wrap
 from magenv.arithmetic import dot2
 from magenv.dynamics import TOUCH, WALL, advance, may_touch, resolve_contact
-from magenv.kernels import in_cache_lines, kernel, law, wide_vectors
+from magenv.kernels import in_cache_lines, kernel, law, typed, wide_vectors
 from magenv.lanes import (
     COEFFICIENTS,
     CONSTANTS,
@@ -71,6 +71,11 @@ def _load_segment(lanes: Floats, i: int, position: float, coefficients: Floats) 
             lanes[COEFFICIENTS + 2 * j + robot, i] = coefficients[segment, robot, j // 4, j % 4]
 
 
+# Typed: for literals numba would compile ``_reference`` anew.
+_FIRST, _SECOND = typed(0), typed(1)
+_X, _Y, _HEADING = typed(0), typed(1), typed(2)
+
+
 @law
 def _reference(lanes: Floats, i: int, robot: int, axis: int) -> float:
     """Return a coordinate of the reference: x, y or heading of a robot."""
@@ -92,13 +97,13 @@ def _count(lanes: Floats, i: int, h: float) -> bool:
 def _measure(lanes: Floats, i: int, substeps: float, loss_distance: float, tracking_distance: float) -> bool:
     """Add lane ``i`` at a substep's end to its measurements; return whether its hold is over."""
     x1, y1, x2, y2 = lanes[X1, i], lanes[Y1, i], lanes[X2, i], lanes[Y2, i]
-    dx, dy = x1 - _reference(lanes, i, 0, 0), y1 - _reference(lanes, i, 0, 1)
+    dx, dy = x1 - _reference(lanes, i, _FIRST, _X), y1 - _reference(lanes, i, _FIRST, _Y)
     first = math.sqrt(dot2(dx, dy, dx, dy))
-    dx, dy = x2 - _reference(lanes, i, 1, 0), y2 - _reference(lanes, i, 1, 1)
+    dx, dy = x2 - _reference(lanes, i, _SECOND, _X), y2 - _reference(lanes, i, _SECOND, _Y)
     second = math.sqrt(dot2(dx, dy, dx, dy))
     position_error = 0.5 * (first + second)
-    turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, 0, 2)))
-    turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, 1, 2)))
+    turned1 = abs(wrap(lanes[HEADING1, i] - _reference(lanes, i, _FIRST, _HEADING)))
+    turned2 = abs(wrap(lanes[HEADING2, i] - _reference(lanes, i, _SECOND, _HEADING)))
     heading_error = 0.5 * (turned1 + turned2)
     separation = dot2(x2 - x1, y2 - y1, x2 - x1, y2 - y1)  # squared: the root is drawn once, at the end
     lanes[POSITION_ERROR, i] += position_error
@@ -130,8 +135,8 @@ def _loss(lanes: Floats, i: int, loss_distance: float) -> int:
         return _TOUCH
     if contact & WALL:
         return _WALL
-    dx1, dy1 = lanes[X1, i] - _reference(lanes, i, 0, 0), lanes[Y1, i] - _reference(lanes, i, 0, 1)
-    dx2, dy2 = lanes[X2, i] - _reference(lanes, i, 1, 0), lanes[Y2, i] - _reference(lanes, i, 1, 1)
+    dx1, dy1 = lanes[X1, i] - _reference(lanes, i, _FIRST, _X), lanes[Y1, i] - _reference(lanes, i, _FIRST, _Y)
+    dx2, dy2 = lanes[X2, i] - _reference(lanes, i, _SECOND, _X), lanes[Y2, i] - _reference(lanes, i, _SECOND, _Y)
     first, second = math.sqrt(dot2(dx1, dy1, dx1, dy1)), math.sqrt(dot2(dx2, dy2, dx2, dy2))
     return 0 if (first <= loss_distance) & (second <= loss_distance) else _DEVIATION
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magenv.angles import arctan2, sincos
 from magenv.arithmetic import dot2, dot3
-from magenv.kernels import kernel, law
+from magenv.kernels import kernel, law, typed
 from magenv.params import Plant, System, require
 from magenv.poses import GAP_TOLERANCE_M, keeps_gap, project_epms
 from magenv.ways import Vector, norm
@@ -83,6 +83,10 @@ def shoulder(shell: Shell, k: int, n_epm: int) -> Vector:
     return -shell.aside * s, shell.aside * c, shell.height
 
 
+_LOOK, _CARRY = typed(False), typed(True)
+"""Values of ``carry``: for literals numba would compile all anew."""
+
+
 @kernel
 def _beyond(epm: Floats, shell: Shell, base: Vector, carry: bool) -> float:
     """Return by how much a centre (3,) is out of the shell round ``base`` (m); where ``carry`` says, move it inside."""
@@ -115,10 +119,10 @@ def project_reach(epms: Floats, r_min: float, r_max: float, gap: float, shell: S
     moved = project_epms(epms, r_min, r_max, gap)
     if shell.outer < math.inf:
         for _ in range(10_000):
-            if beyond_reach(epms, shell, False) <= GAP_TOLERANCE_M:
+            if beyond_reach(epms, shell, _LOOK) <= GAP_TOLERANCE_M:
                 break
             moved = True
-            beyond_reach(epms, shell, True)
+            beyond_reach(epms, shell, _CARRY)
             project_epms(epms, r_min, r_max, gap)
     return moved
 
@@ -141,7 +145,7 @@ def make_allowed(epms: Floats, row: int, limits: Floats) -> bool:
 
     Returns whether they were.
     """
-    near = limits[4] == math.inf or beyond_reach(epms[row], shell_of(limits), False) == 0.0
+    near = limits[4] == math.inf or beyond_reach(epms[row], shell_of(limits), _LOOK) == 0.0
     return False if near and keeps_gap(epms, row, limits[2]) else project_within(epms[row], limits)
 
 

@@ -6,11 +6,13 @@ are unpacked once. The arrays stay numpy's: whoever holds them sees what the ker
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import types
 from numba.experimental import structref
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from magenv.kernels import kernel, uncounted
@@ -150,9 +152,28 @@ class _Packed(structref.StructRefProxy):
 structref.define_proxy(_Packed, _PackedType, State._fields)  # type: ignore[no-untyped-call]
 
 
+def _pack_parts(typing_context: Any, state: Any) -> Any:
+    parts = tuple(zip(state.fields, state.types, strict=True))
+    packed = _PackedType(parts)  # type: ignore[no-untyped-call]
+    new: Any = structref.new
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        one = context.compile_internal(builder, lambda: new(packed), packed(), ())
+        for i, (name, kind) in enumerate(parts):
+            put = context.get_setattr(name, types.void(packed, kind))
+            put(builder, (one, builder.extract_value(arguments[0], i)))
+        return one
+
+    return packed(state), generate
+
+
+pack_parts = cast("Callable[[State], _Packed]", intrinsic(_pack_parts))
+"""Return a packed state of these parts: its own constructor, of an argument each, took long to compile."""
+
+
 @kernel
 def _pack(state: State) -> _Packed:
-    return _Packed(*uncounted(state))  # type: ignore[no-untyped-call]
+    return pack_parts(uncounted(state))
 
 
 def packed(state: State) -> State:
