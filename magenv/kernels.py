@@ -72,7 +72,8 @@ class _Uncollected(event.Listener):
 
     def __init__(self) -> None:
         self._begin()
-        os.register_at_fork(after_in_child=self._after_fork)
+        if hasattr(os, "register_at_fork"):  # Windows knows no forks
+            os.register_at_fork(after_in_child=self._after_fork)
 
     def _begin(self) -> None:
         self._lock, self._compiling, self._collected = threading.Lock(), 0, True

@@ -212,7 +212,7 @@ def begin_episodes(first: int, last: int, mask: Bools, s: State, observations: O
             copy_epms(present, i, targets, i)  # what is held until something else is commanded
         if mask[i] and s.uncertain:
             add_noise(measured, i, s.plant_key[i], _ONLY[0], s.noise_position, s.noise_heading, stream)
-            for j in range(6):
+            for j in range(COORDINATES):
                 before[i, j // 3, j % 3] = measured[i, j // 3, j % 3]
     expected = s.expected
     for i in range(first, last):
