@@ -49,7 +49,7 @@ from magenv.lanes import (
 )
 from magenv.magnets import Size, copy_epms, place_all
 from magenv.trajectories import SEGMENTS, cubic, spline_position, trajectory_of
-from magenv.travel import Motion, carry, command, give_way, go_on, is_due, put_down, set_off, take_up
+from magenv.travel import Motion, carry, command, give_way, go_on, is_due, moves, put_down, set_off, take_up
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -203,10 +203,10 @@ def hold_rows(
         for i in range(width):
             lanes[j, i] = 0.0
     rows, flagged = np.full(width, -1), np.zeros(width, np.bool_)
-    h, upcoming, busy, idle = period / substeps, first, 0, True
+    h, upcoming, busy, idle, calm = period / substeps, first, 0, True, 0
     while True:
         if idle:  # load rows into the lanes that have none
-            idle = False
+            idle, calm = False, 0
             for i in range(width):
                 while rows[i] < 0 and upcoming < last:
                     row = upcoming
@@ -243,10 +243,11 @@ def hold_rows(
         if late:
             for i in range(width):
                 flagged[i] = (rows[i] >= 0) & (lanes[DONE, i] == motion.lag)
-                if travels:
+                if travels and calm < 2:
                     flagged[i] |= (rows[i] >= 0) & is_due(lanes, i, n_epm)
                 rare |= flagged[i]
             if rare:
+                calm = 0
                 for i in range(width):
                     row = rows[i]
                     if flagged[i]:
@@ -259,8 +260,8 @@ def hold_rows(
                                 place_all(lanes, i, epm_size, epm_moment, epms, row)
                         if travels:
                             set_off(lanes, i, n_epm, motion)
-        rare = False
-        if travels:
+        if travels and calm < 2:  # two substeps after the last moved, all EPMs act from where they stand
+            calm, rare = calm + 1, False
             for i in range(width):
                 flagged[i] = (rows[i] >= 0) & go_on(lanes, i, n_epm, motion)
                 rare |= flagged[i]
@@ -268,10 +269,17 @@ def hold_rows(
                 for i in range(width):
                     if flagged[i]:
                         give_way(lanes, i, n_epm, motion)
+                calm = 0
+            rare = False
+            for k in range(n_epm):
+                for i in range(width):
+                    carry(lanes, i, n_epm, k, epm_size)
+                    flagged[i] = (rows[i] >= 0) & moves(lanes, i, n_epm, k)
+                    rare |= flagged[i]
+            if rare:
+                calm = 0
         rare = False
         for i in range(width):
-            if travels:
-                carry(lanes, i, n_epm, epm_size)
             advance(lanes, i, n_epm, epm_size, h, rough)
             flagged[i] = (rows[i] >= 0) & (_count(lanes, i, h) | may_touch(lanes, i, diameter, wall_radius))
             rare |= flagged[i]

@@ -26,6 +26,7 @@ from magenv.poses import EPM_SIZE, GAP_TOLERANCE_M
 from magenv.reach import REACH_TOLERANCE_M, Shell, project_reach, room, shoulder, stays
 from magenv.ways import (
     Vector,
+    at_rest,
     brake,
     go_way,
     goes_on,
@@ -119,7 +120,7 @@ def _draw_way(lanes: Floats, i: int, n_epm: int, k: int, motion: Motion) -> None
 def _go(lanes: Floats, i: int, e: int) -> None:
     """Write where the centre of the EPM whose fields begin at ``e`` goes, alone, in a substep."""
     (x, y, z), change, moves, there = go_way(lanes, i, e + _WAY)
-    growth = lanes[e + _GROWTH, i] + change * lanes[e + _BEND, i]
+    growth = lanes[e + _GROWTH, i] + change * lanes[e + _BEND, i] if moves else 0.0
     radius = lanes[e + _RADIUS, i] + growth
     lanes[e + _GROWTH, i], lanes[e + _RADIUS, i] = growth, radius
     gx, gy, gz = read(lanes, i, e + _GOAL)
@@ -156,6 +157,13 @@ def is_due(lanes: Floats, i: int, n_epm: int) -> bool:
         for w in (route(n_epm, k) + _WAY, route(n_epm, k) + _TURN):
             due |= is_waiting(lanes, i, w)
     return due
+
+
+@law
+def moves(lanes: Floats, i: int, n_epm: int, k: int) -> bool:
+    """Return whether the ``k``-th EPM of lane ``i`` goes on in the next substep."""
+    e = route(n_epm, k)
+    return not (at_rest(lanes, i, e + _WAY) & at_rest(lanes, i, e + _TURN))
 
 
 @kernel
@@ -262,18 +270,17 @@ def give_way(lanes: Floats, i: int, n_epm: int, motion: Motion) -> None:
 
 
 @law
-def carry(lanes: Floats, i: int, n_epm: int, size: Size) -> None:
-    """Carry the EPMs of lane ``i`` to where they go; put what acts on the robots where they are halfway."""
-    for k in range(n_epm):
-        e = route(n_epm, k)
-        x, y, z = read(lanes, i, e + _CENTRE)
-        p, q, r = read(lanes, i, e + _NEXT)
-        write(lanes, i, e + _CENTRE, p, q, r)
-        ux, uy, uz = read(lanes, i, e + _MOMENT)
-        vx, vy, vz = _turn(lanes, i, e)
-        x, y, z = 0.5 * (x + p), 0.5 * (y + q), 0.5 * (z + r)
-        ux, uy, uz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)
-        place_epm(lanes, i, k, size, lanes[carried_moment(n_epm) + k, i], x, y, z, ux, uy, uz)
+def carry(lanes: Floats, i: int, n_epm: int, k: int, size: Size) -> None:
+    """Carry the ``k``-th EPM of lane ``i`` to where it goes; put what acts on the robots where it is halfway."""
+    e = route(n_epm, k)
+    x, y, z = read(lanes, i, e + _CENTRE)
+    p, q, r = read(lanes, i, e + _NEXT)
+    write(lanes, i, e + _CENTRE, p, q, r)
+    ux, uy, uz = read(lanes, i, e + _MOMENT)
+    vx, vy, vz = _turn(lanes, i, e)
+    x, y, z = 0.5 * (x + p), 0.5 * (y + q), 0.5 * (z + r)
+    ux, uy, uz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)
+    place_epm(lanes, i, k, size, lanes[carried_moment(n_epm) + k, i], x, y, z, ux, uy, uz)
 
 
 @kernel

@@ -167,9 +167,16 @@ def go_way(lanes: Floats, i: int, w: int) -> tuple[Vector, float, bool, bool]:
 
 
 @law
+def at_rest(lanes: Floats, i: int, w: int) -> bool:
+    """Return whether the way whose fields begin at ``w`` is at its end."""
+    rests: bool = lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i] == 0.0
+    return rests
+
+
+@law
 def is_waiting(lanes: Floats, i: int, w: int) -> bool:
     """Return whether the way whose fields begin at ``w`` is at its end and a goal is to be set off for."""
-    waiting: bool = (lanes[w + _NEW, i] > 0.0) & (lanes[w + _UP, i] + lanes[w + _FLAT, i] + lanes[w + _DOWN, i] == 0.0)
+    waiting: bool = (lanes[w + _NEW, i] > 0.0) & at_rest(lanes, i, w)
     return waiting
 
 

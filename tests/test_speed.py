@@ -70,6 +70,7 @@ def same(one: Steps, two: Steps, rows: slice) -> bool:
         ("approach-45", "moving", 2),
         ("approach-45", "moving", 3),
         ("approach-45", "cylinders", 2),
+        ("approach-45", "arm", 3),
     ],
 )
 def test_bits_depend_neither_on_lanes_nor_on_threads(scenario: str, plant: str, n_epm: int) -> None:
@@ -153,12 +154,13 @@ def test_nan_in_a_lane_never_touches_its_neighbours() -> None:
 # Machine code
 
 
-def machine_code(plant: str) -> Any:
-    """The hold of two EPMs in sixteen lanes, compiled here: numba does not show cached code."""
+def machine_code(plant: str, n_epm: int = 2) -> Any:
+    """The hold in sixteen lanes, compiled here: numba does not show cached code."""
     cached: Any = hold_rows
-    world, idle = World(16, System(), PLANTS[plant], TaskParams()), np.zeros(16, np.bool_)
+    world, idle = World(16, System(n_epm=n_epm), PLANTS[plant], TaskParams()), np.zeros(16, np.bool_)
+    _, _, *how = world.shape
     fresh = numba.njit(error_model="numpy", nogil=True)(cached.py_func)
-    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(2, 16))
+    fresh(0, 16, idle, world.robots, world.epms, world.epms, *world.held, *hold_shape(n_epm, 16, *how))
     return fresh
 
 
@@ -167,15 +169,27 @@ def compiled() -> Any:
     return machine_code("paper")
 
 
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
-def test_substeps_are_vectorised(compiled: Any) -> None:
-    """The five dipoles' products and sums, 25 each, work on several lanes at once: as many as the processor has."""
-    (assembly,) = compiled.inspect_asm().values()
+def check_vectors(fresh: Any, least: int) -> None:
+    """Sums of products, ``least`` or more, work on several lanes at once: as many as the processor has."""
+    (assembly,) = fresh.inspect_asm().values()
     registers = re.findall(r"\bvfn?m(?:add|sub)\d+pd\b[^\n]*%([xyz]mm)\d+$", assembly, re.M)
-    assert len(registers) >= 5 * 25
+    assert len(registers) >= least
     wide = llvmlite.binding.get_host_cpu_features().get("avx512f", False)
     assert set(registers) == {"zmm" if wide else "ymm"}
     assert not re.search(r"\bv?(mul|add)ps\b", assembly), "nothing is rounded to single precision"
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+def test_substeps_are_vectorised(compiled: Any) -> None:
+    """Five dipoles, 25 sums of products each."""
+    check_vectors(compiled, 5 * 25)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
+@pytest.mark.parametrize(("plant", "n_epm"), [("paper", 3), ("moving", 2), ("moving", 3), ("arm", 3)])
+def test_substeps_of_more_epms_and_of_moving_ones_are_vectorised(plant: str, n_epm: int) -> None:
+    """Beside the dipoles of the EPMs and the robots, two ways of each EPM that moves: eight sums of products each."""
+    check_vectors(machine_code(plant, n_epm), (1 + 2 * n_epm) * 25 + (2 * n_epm * 8 if plant != "paper" else 0))
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="looks for x86 instructions")
