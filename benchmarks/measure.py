@@ -44,6 +44,8 @@ class Effort:
     """Targets of a class of allocation."""
     batch: int = 1000
     """Targets in one call."""
+    cold_starts: int = 3
+    """New processes without compiled kernels on disk, one after the other."""
     processes: int = 8
     """Processes that start at once."""
     memory_steps: int = 1_000_000

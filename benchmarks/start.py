@@ -70,11 +70,13 @@ def measure(effort: Effort) -> Iterator[Line]:
     """Measure all of this part."""
     with tempfile.TemporaryDirectory() as folder:
         for what, code in (("make and step", SCALAR), ("make_vec and step", BATCH)):
-            cache = Path(folder) / what
             tell(f"{what}, cold cache")
-            cold = seconds(code, cache)
-            yield Row(f"new process, {what}, cache cold", cold, "s", wanted=Limit(COLD_S, "s", False), note="once")
-            warm = float(np.median([seconds(code, cache) for _ in range(effort.repeats)]))
+            caches = [Path(folder) / f"{what} {i}" for i in range(effort.cold_starts)]
+            times = [seconds(code, cache) for cache in caches]
+            note = f"median of {len(times)}: {min(times):.1f} to {max(times):.1f} s"
+            cold, limit = float(np.median(times)), Limit(COLD_S, "s", False)
+            yield Row(f"new process, {what}, cache cold", cold, "s", wanted=limit, note=note)
+            warm = float(np.median([seconds(code, caches[0]) for _ in range(effort.repeats)]))
             yield Row(f"new process, {what}, cache warm", warm, "s", wanted=Limit(WARM_S, "s", False))
         imported = float(np.median([seconds(IMPORT, Path(folder)) for _ in range(effort.repeats)]))
         yield Row("new process, import magenv", imported, "s", wanted=Limit(IMPORT_S, "s", False))
