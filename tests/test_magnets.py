@@ -126,6 +126,7 @@ def test_epms_on_their_way_are_the_same_cylinders(rng: np.random.Generator) -> N
     lane = np.zeros((fields(2, True), 1))
     take_up(lane, 0, physics.epm_moment[0], epms, np.zeros((2, 48)))
     assert not go_on(lane, 0, 2, motion)
-    carry(lane, 0, 2, physics.epm_size)
+    for k in range(2):
+        carry(lane, 0, 2, k, physics.epm_size)
     placed = slice(EPMS, EPMS + 2 * EPM_SIZE)
     np.testing.assert_array_equal(lane[placed], one_lane(robots, epms, physics, 0.005)[placed])
