@@ -161,7 +161,7 @@ def is_due(lanes: Floats, i: int, n_epm: int) -> bool:
 
 @law
 def moves(lanes: Floats, i: int, n_epm: int, k: int) -> bool:
-    """Return whether the ``k``-th EPM of lane ``i`` goes on in the next substep."""
+    """Return whether the ``k``-th EPM of lane ``i`` is on its way; one that waits to set off is not."""
     e = route(n_epm, k)
     return not (at_rest(lanes, i, e + _WAY) & at_rest(lanes, i, e + _TURN))
 
