@@ -59,6 +59,8 @@ LOSSES = ("none", "deviation", "touch", "wall")
 _DEVIATION, _TOUCH, _WALL = 1, 2, 3
 AT_ONCE, LATE, TRAVELLING = range(3)
 """How commands act: EPMs are there as the hold begins, or some substeps later, or travel there, perhaps later."""
+_STAND = 2
+"""Substeps without motion after which EPMs need no carrying: they act from where they stand, in a move from halfway."""
 
 
 @law
@@ -243,7 +245,7 @@ def hold_rows(
         if late:
             for i in range(width):
                 flagged[i] = (rows[i] >= 0) & (lanes[DONE, i] == motion.lag)
-                if travels and calm < 2:
+                if travels and calm < _STAND:
                     flagged[i] |= (rows[i] >= 0) & is_due(lanes, i, n_epm)
                 rare |= flagged[i]
             if rare:
@@ -260,7 +262,7 @@ def hold_rows(
                                 place_all(lanes, i, epm_size, epm_moment, epms, row)
                         if travels:
                             set_off(lanes, i, n_epm, motion)
-        if travels and calm < 2:  # two substeps after the last moved, all EPMs act from where they stand
+        if travels and calm < _STAND:
             calm, rare = calm + 1, False
             for i in range(width):
                 flagged[i] = (rows[i] >= 0) & go_on(lanes, i, n_epm, motion)
